@@ -1,0 +1,70 @@
+# `make` lists the targets. The first one used builds the environment, .venv; nothing is needed before it but
+# Python 3.11, make and a C compiler. Pip's own settings (PIP_INDEX_URL, PIP_FIND_LINKS, ...) say where packages come
+# from, and so whether torch is its CPU or its CUDA build.
+
+# Deferred: looked up only when the environment is made. Override with `make PYTHON=...`.
+PYTHON ?= $(shell for p in python3.11 python3; do \
+	$$p -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null && echo $$p && break; done)
+PY  := .venv/bin/python
+PIP := $(PY) -m pip --disable-pip-version-check -qq install -c constraints.txt --no-build-isolation
+ENV := .venv/.complete
+ARGS ?=
+
+.DEFAULT_GOAL := help
+.PHONY: help reproduce test bench docs lint clean distclean
+
+help:  ## list the targets
+	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
+
+# One line a script, in the order in which they run.
+reproduce: $(ENV)  ## the paper's figures and tables, into results/
+	@mkdir -p results
+	$(PY) scripts/figure3_masses.py
+
+test: $(ENV)  ## every test and docstring example (ARGS="-m 'not slow'" for the quick ones)
+	@ignore=; $(PY) -c 'import pybullet' 2>/dev/null || ignore=--ignore=torch_dpc/systems/quadrotor.py; \
+	set -x; $(PY) -m pytest tests --doctest-modules torch_dpc $$ignore $(ARGS)
+
+bench: $(ENV)  ## time and error of the layer (ARGS=--quick for a short run)
+	$(PY) scripts/benchmark.py $(ARGS)
+
+docs: .venv/.complete-docs  ## the documentation, into site/
+	$(PY) -m sphinx -q -W --keep-going docs site
+	@echo "Open site/index.html"
+
+lint: $(ENV)  ## ruff and mypy
+	$(PY) -m ruff check .
+	$(PY) -m mypy
+
+clean:  ## remove what the other targets leave, but keep .venv
+	rm -rf results site build *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	find . -name .venv -prune -o -name __pycache__ -type d -exec rm -rf {} +
+
+distclean: clean  ## remove .venv too
+	rm -rf .venv
+
+# The stamp is written last, so an install that failed or was interrupted is taken up again by the next run.
+# An environment without a working pip was cut short before it was of use to anybody: it is begun anew.
+$(ENV): setup.cfg constraints.txt
+	@$(PY) -m pip --version >/dev/null 2>&1 || { \
+	test -n "$(PYTHON)" || { echo "Python 3.11 was not found: install it, or name one with make PYTHON=..."; exit 1; }; \
+	echo "Creating .venv with $(PYTHON) (about 2 minutes the first time) ..."; $(PYTHON) -m venv --clear .venv; }
+	@echo "[1/4] PyTorch ..."
+	@$(PIP) setuptools torch
+	@echo "[2/4] torch_dpc, test tools, plotting ..."
+	@$(PIP) -e '.[scripts,dev]'
+	@echo "[3/4] quadrotor simulator ..."
+	@$(PIP) -e '.[quadrotor]' || $(call without,the quadrotor)
+	@echo "[4/4] baselines ..."
+	@$(PIP) -e '.[baselines]' || $(call without,the cvxpylayers and QPLayer baselines)
+# qpth works with numpy 2 but declares numpy<2, and pip would take cvxpy and cvxpylayers back years to please it.
+	@$(PIP) --no-deps qpth || $(call without,the qpth baseline)
+	@touch $@
+
+.venv/.complete-docs: $(ENV)
+	@echo "Installing the documentation tools ..."
+	@$(PIP) -e '.[docs]'
+	@touch $@
+
+# torch_dpc works without the simulator and the baselines, so one that cannot be had here does not stop the rest.
+without = echo "NOTE: this environment is without $(1); the rest works. To try again: touch setup.cfg"

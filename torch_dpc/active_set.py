@@ -1,0 +1,135 @@
+"""Small symmetric systems on the active rows, one set of rows a sample.
+
+A sample with active rows A needs  lam_A = G[A, A]^-1 rhs_A,  lam = 0 elsewhere: Newton's step in the forward solve,
+the adjoint in the backward one. The rows of a group of samples are packed to the longest list and the missing ones
+read an identity, so that one batched Cholesky serves; samples whose active rows are (nearly) dependent go through a
+QR of the rows of Ct, because G = Ct Ct' squares their condition.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+#: Below this ratio of the extreme pivots a Cholesky factor of G[A, A] is not trusted.
+PIVOT_RATIO = 1e-5
+#: Rows of Ct that stand out of the span of the others by less than this fraction of their length are dependent.
+DEPENDENT_ROW = 1e-9
+#: Samples of like size that share one padded factorisation on the CPU.
+GROUP = 128
+#: Up to this many samples NumPy, one after the other, beats the packing.
+FEW = 4
+
+
+def solve_active(G: Tensor, Ct: Tensor, active: Tensor, rhs: Tensor) -> tuple[Tensor, Tensor]:
+    """Solve G[A, A] lam_A = rhs_A for every sample.
+
+    Args:
+        G, Ct: `(N, N)` and `(N, n_x)` with G = Ct Ct', or one a sample, `(B, N, N)` and `(B, N, n_x)`.
+        active: the rows A of each sample, `(B, N)`, boolean.
+        rhs: `(B, N)`; entries outside A are ignored.
+
+    Returns:
+        lam `(B, N)`, zero outside A, and whether the rows A were independent, `(B,)`. Where they were not, dependent
+        rows are left out (lam = 0).
+    """
+    on_cpu = rhs.device.type == "cpu"
+    lam, trusted = (_one_by_one if on_cpu and len(rhs) <= FEW else _packed)(G, active, rhs)
+    for i in _where_not(trusted):
+        chosen = active[i].nonzero()[:, 0]
+        rows, R = _independent_rows(Ct if Ct.ndim == 2 else Ct[i], chosen)
+        lam[i] = 0.0
+        lam[i, rows] = torch.cholesky_solve(rhs[i, rows, None], R, upper=True)[:, 0]
+        trusted[i] = len(rows) == len(chosen)
+    return lam, trusted
+
+
+def _where_not(flags: Tensor) -> list[int]:
+    return [] if bool(flags.all()) else (~flags).nonzero()[:, 0].tolist()
+
+
+def _one_by_one(G: Tensor, active: Tensor, rhs: Tensor) -> tuple[Tensor, Tensor]:
+    lam, trusted = torch.zeros_like(rhs), torch.ones(len(rhs), dtype=torch.bool)
+    matrices, rows_of, right = G.numpy(), active.numpy(), rhs.numpy()
+    for i, out in enumerate(lam.numpy()):
+        rows = rows_of[i].nonzero()[0]
+        if len(rows):
+            block = (matrices if G.ndim == 2 else matrices[i])[rows[:, None], rows]
+            try:
+                pivots = np.linalg.cholesky(block).diagonal()
+            except np.linalg.LinAlgError:
+                trusted[i] = False
+                continue
+            trusted[i] = bool(pivots.min() > PIVOT_RATIO * pivots.max())
+            out[rows] = np.linalg.solve(block, right[i, rows])
+    return lam, trusted
+
+
+def _packed(G: Tensor, active: Tensor, rhs: Tensor) -> tuple[Tensor, Tensor]:
+    n = rhs.shape[1]
+    lam = torch.zeros_like(rhs)
+    trusted = torch.ones(len(rhs), dtype=torch.bool, device=rhs.device)
+    count = active.sum(dim=1)
+    order = count.argsort()
+    # Samples of like size together: padding all to the largest would cost several times the flops.
+    group = GROUP if rhs.device.type == "cpu" else max(len(order), 1)
+    table = _identity_padded(G)
+    for part in order.split(group):
+        index = _pack(active[part], count[part])
+        L, info = torch.linalg.cholesky_ex(_blocks(table, index, part))
+        x = torch.cholesky_solve(rhs[part].gather(1, index.clamp_max(n - 1))[..., None], L)[..., 0]
+        lam[part] = x.new_zeros(len(part), 2 * n).scatter_(1, index, x)[:, :n]
+        trusted[part] = (info == 0) & _pivots_are_clear(L, index < n)
+    return lam, trusted
+
+
+def _identity_padded(G: Tensor) -> Tensor:
+    """Return [[G, 0], [0, I]]: positions N, N + 1, ... are rows of an identity, for lists that are too short."""
+    n = G.shape[-1]
+    table = G.new_zeros(*G.shape[:-2], 2 * n, 2 * n)
+    table[..., :n, :n] = G
+    table.diagonal(dim1=-2, dim2=-1)[..., n:] = 1.0
+    return table
+
+
+def _pack(active: Tensor, count: Tensor) -> Tensor:
+    """Return the positions of the active rows, `(b, k)`, filled up with N, N + 1, ..."""
+    n = active.shape[1]
+    k = int(count.max()) if len(count) else 0
+    sample, row = active.nonzero(as_tuple=True)
+    index = torch.arange(n, n + k, device=active.device).repeat(len(active), 1)
+    place = torch.arange(len(row), device=active.device) - (count.cumsum(0) - count)[sample]
+    index[sample, place] = row
+    return index
+
+
+def _blocks(table: Tensor, index: Tensor, samples: Tensor) -> Tensor:
+    """Return G[A, A] of each sample, `(b, k, k)`."""
+    width = table.shape[-1]
+    flat = index[:, :, None] * width + index[:, None, :]
+    if table.ndim == 3:
+        flat = flat + samples[:, None, None] * width * width
+    return table.reshape(-1).index_select(0, flat.reshape(-1)).reshape(flat.shape)
+
+
+def _pivots_are_clear(L: Tensor, real: Tensor) -> Tensor:
+    """Return which factors have no pivot that rounding alone could have made."""
+    if L.shape[-1] == 0:
+        return torch.ones(len(L), dtype=torch.bool, device=L.device)
+    pivots = L.diagonal(dim1=-2, dim2=-1)
+    largest = torch.where(real, pivots, 0.0).amax(-1)
+    smallest = torch.where(real, pivots, torch.inf).amin(-1)
+    return smallest > PIVOT_RATIO * largest
+
+
+def _independent_rows(Ct: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
+    """Return a linearly independent subset of the rows, and R upper triangular with R'R = G[rows, rows]."""
+    while True:
+        R = torch.linalg.qr(Ct[rows].T, mode="r").R
+        pivots = torch.zeros(len(rows), dtype=R.dtype, device=R.device)
+        pivots[: R.shape[0]] = R.diagonal().abs()
+        keep = pivots > DEPENDENT_ROW * torch.linalg.vector_norm(Ct[rows], dim=1)
+        if bool(keep.all()):
+            return rows, R
+        rows = rows[keep]
