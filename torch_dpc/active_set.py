@@ -51,19 +51,29 @@ def _where_not(flags: Tensor) -> list[int]:
 
 def _one_by_one(G: Tensor, active: Tensor, rhs: Tensor) -> tuple[Tensor, Tensor]:
     lam, trusted = torch.zeros_like(rhs), torch.ones(len(rhs), dtype=torch.bool)
-    matrices, rows_of, right = G.numpy(), active.numpy(), rhs.numpy()
-    for i, out in enumerate(lam.numpy()):
+    matrices, rows_of, right, out = G.numpy(), active.numpy(), rhs.numpy(), lam.numpy()
+    for i in range(len(rhs)):
         rows = rows_of[i].nonzero()[0]
-        if len(rows):
-            block = (matrices if G.ndim == 2 else matrices[i])[rows[:, None], rows]
-            try:
-                pivots = np.linalg.cholesky(block).diagonal()
-            except np.linalg.LinAlgError:
-                trusted[i] = False
-                continue
-            trusted[i] = bool(pivots.min() > PIVOT_RATIO * pivots.max())
-            out[rows] = np.linalg.solve(block, right[i, rows])
+        solved = solve_rows(matrices if G.ndim == 2 else matrices[i], rows, right[i, rows])
+        if solved is None:
+            trusted[i] = False
+        else:
+            out[i, rows] = solved
     return lam, trusted
+
+
+def solve_rows(G: np.ndarray, rows: np.ndarray, rhs: np.ndarray) -> np.ndarray | None:
+    """Return G[rows, rows]^-1 rhs, or None where Cholesky says that G cannot be trusted with it."""
+    if len(rows) == 0:
+        return rhs
+    block = G[rows[:, None], rows]
+    try:
+        pivots = np.linalg.cholesky(block).diagonal()
+    except np.linalg.LinAlgError:
+        return None
+    if not pivots.min() > PIVOT_RATIO * pivots.max():
+        return None
+    return np.linalg.solve(block, rhs)
 
 
 def _packed(G: Tensor, active: Tensor, rhs: Tensor) -> tuple[Tensor, Tensor]:

@@ -4,138 +4,101 @@
 
 H = I and Ct are set up once; a call updates the bounds alone. DAQP (Arnstrom, Bemporad, Axehill 2022) is finite and
 exact for boxes, so it also takes the samples on which Newton's sets cycle. It supplies the active set only: the
-multipliers and v come from the same systems as Newton's.
+multipliers come from the same systems as Newton's.
 """
 
 from __future__ import annotations
 
 import threading
 from typing import Any
-from weakref import WeakKeyDictionary
 
 import daqp
 import numpy as np
 import torch
 from torch import Tensor
 
-from .active_set import solve_active
+from .active_set import solve_active, solve_rows
 from .newton import ActiveSetResult
 
 #: DAQP's default, 1e-6, calls slightly infeasible problems solved.
 PRIMAL_TOLERANCE = 1e-10
-#: What DAQP reads as no bound.
-NO_BOUND = 1e30
-#: DAQP's exit flag for a problem without a feasible point.
-INFEASIBLE_FLAG = -1
+#: DAQP's exit flag for an optimal solution.
 SOLVED_FLAG = 1
-_FREE, _EQUALITY = 0, 5
-
-# One workspace a thread: a `Model` shared by threads gives wrong answers. It is kept out of every module, because it
-# neither copies nor pickles, and goes when the matrix it was set up for goes.
-_local = threading.local()
+_EQUALITY = np.int32(5)
+#: What DAQP reads as no bound.
+_NO_BOUND = 1e30
 
 
-def solve_daqp(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> tuple[ActiveSetResult, Tensor]:
-    """Solve the samples one after the other; the arguments are those of `solve_newton`.
+class Daqp:
+    """One workspace a thread for each matrix: a `daqp.Model` shared by threads gives wrong answers.
 
-    Returns:
-        The result, and which samples DAQP calls infeasible, `(B,)`.
+    Kept by the factors of a layer, which never travel with copies or pickles; a `Model` does neither.
+
+    Args:
+        Ct: the rows, `(N, n_x)`.
     """
-    active = torch.zeros_like(v0, dtype=torch.bool)
-    at_upper = torch.zeros_like(active)
-    iterations = torch.zeros(len(v0), dtype=torch.int64)
-    flags = np.zeros(len(v0), dtype=np.int64)
-    lo = lower.expand_as(v0).cpu().numpy()
-    hi = upper.expand_as(v0).cpu().numpy()
-    centre = v0.cpu().numpy()
-    is_active, is_upper = active.cpu().numpy(), at_upper.cpu().numpy()
-    for i in range(len(v0)):
-        tight = lo[i] == hi[i]
-        sense = np.where(tight, _EQUALITY, _FREE).astype(np.int32)
-        model = _model(Ct) if Ct.ndim == 2 else _set_up(Ct[i])
-        lam, flags[i], iterations[i] = _solve_one(model, lo[i] - centre[i], hi[i] - centre[i], sense)
-        if flags[i] == SOLVED_FLAG:
-            is_active[i], is_upper[i] = (lam != 0) | tight, lam > 0
-    active, at_upper = torch.from_numpy(is_active).to(v0.device), torch.from_numpy(is_upper).to(v0.device)
-    bound = torch.where(at_upper, upper, lower)
-    solved = torch.from_numpy(flags == SOLVED_FLAG).to(v0.device)
-    multipliers, _ = solve_active(G, Ct, active, v0 - torch.where(active, bound, v0))
-    result = ActiveSetResult(multipliers, iterations.to(v0.device), solved)
-    return result, torch.from_numpy(flags == INFEASIBLE_FLAG).to(v0.device)
+
+    def __init__(self, Ct: Tensor):
+        self._Ct = np.ascontiguousarray(Ct.detach().cpu().numpy())
+        self._local = threading.local()
+
+    def solve(self, lower: np.ndarray, upper: np.ndarray, tight: np.ndarray) -> tuple[np.ndarray, int, int]:
+        """Return multipliers `(N,)`, exit flag and iterations for lower <= Ct x <= upper, equal where tight."""
+        model = getattr(self._local, "model", None)
+        if model is None:
+            model = self._local.model = self._set_up()
+        # `sense` drops the warm start, so that the answer does not depend on history. After a rejected update, `solve`
+        # would return the answer of the problem before with a flag that says solved.
+        sense = tight * _EQUALITY
+        rejected = model.update(bupper=upper, blower=lower, sense=sense)
+        if rejected < 0:
+            return np.zeros_like(lower), int(rejected), 0
+        _, _, flag, info = model.solve()
+        return np.asarray(info["lam"]), int(flag), int(info["iterations"])
+
+    def _set_up(self) -> Any:
+        model = daqp.Model()
+        rows, n = self._Ct.shape
+        bound = np.full(rows, _NO_BOUND)
+        flag, _ = model.setup(np.eye(n), np.zeros(n), self._Ct, bound, -bound, np.zeros(rows, dtype=np.int32))
+        if flag < 0:
+            raise RuntimeError(f"DAQP could not set up the reduced problem, exit flag {flag}.")
+        model.settings = {"primal_tol": PRIMAL_TOLERANCE}
+        return model
 
 
-def _solve_one(model: Any, lower: np.ndarray, upper: np.ndarray, sense: np.ndarray) -> tuple[np.ndarray, int, int]:
-    """Return multipliers, exit flag and iterations of one problem.
+def solve_daqp(
+    G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor, workspace: Daqp | None = None
+) -> ActiveSetResult:
+    """Solve the samples one after the other; arguments and result are those of `solve_newton`.
 
-    `sense` is passed at every update: it drops the warm start, so that the answer does not depend on history. After
-    a rejected update `solve` would return the answer of the problem before, with a flag that says solved.
+    Args:
+        G, Ct, v0, lower, upper: as there.
+        workspace: the one of a shared Ct; made anew for each call and sample by default.
     """
-    rejected = model.update(
-        bupper=np.clip(upper, -NO_BOUND, NO_BOUND), blower=np.clip(lower, -NO_BOUND, NO_BOUND), sense=sense
-    )
-    if rejected < 0:
-        return np.zeros_like(lower), int(rejected), 0
-    _, _, flag, info = model.solve()
-    return np.asarray(info["lam"]), int(flag), int(info["iterations"])
+    lam = np.zeros(v0.shape)
+    iterations, solved = np.zeros(len(v0), dtype=np.int64), np.zeros(len(v0), dtype=bool)
+    centres, lowers, uppers = (x.detach().cpu().numpy() for x in (v0, lower, upper))
+    grams = G.detach().cpu().numpy()
+    for i, centre in enumerate(centres):
+        lo, hi = (lowers, uppers) if lower.ndim == 1 else (lowers[i], uppers[i])
+        tight = lo == hi
+        daqp_of_sample = workspace or Daqp(Ct if Ct.ndim == 2 else Ct[i])
+        found, flag, iterations[i] = daqp_of_sample.solve(lo - centre, hi - centre, tight)
+        solved[i] = flag == SOLVED_FLAG
+        rows = np.flatnonzero((found != 0) | tight)
+        rhs = (centre - np.where(found > 0, hi, lo))[rows]
+        exact = solve_rows(grams if G.ndim == 2 else grams[i], rows, rhs)
+        if exact is None:
+            exact = _by_qr(G if G.ndim == 2 else G[i], Ct if Ct.ndim == 2 else Ct[i], rows, rhs)
+        lam[i, rows] = exact
+    device = v0.device
+    return ActiveSetResult(*(torch.from_numpy(x).to(device) for x in (lam, iterations, solved)))
 
 
-def _model(Ct: Tensor) -> Any:
-    """Return this thread's workspace for a matrix."""
-    models = getattr(_local, "models", None)
-    if models is None:
-        models = _local.models = WeakKeyDictionary()
-    model = models.get(Ct)
-    if model is None:
-        model = models[Ct] = _set_up(Ct)
-    return model
-
-
-def _set_up(Ct: Tensor) -> Any:
-    model = daqp.Model()
-    rows, n = Ct.shape
-    bound = np.full(rows, NO_BOUND)
-    matrix = np.ascontiguousarray(Ct.cpu().numpy())
-    flag, _ = model.setup(np.eye(n), np.zeros(n), matrix, bound, -bound, np.zeros(rows, dtype=np.int32))
-    if flag < 0:
-        raise RuntimeError(f"DAQP could not set up the reduced problem, exit flag {flag}.")
-    model.settings = {"primal_tol": PRIMAL_TOLERANCE}
-    return model
-
-
-def infeasibility_certificate(Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> bool:
-    """Return whether one sample `(N,)` is proven to have no v = v0 + Ct x between its bounds.
-
-    By Farkas' lemma a direction d with Ct' d = 0 and d'v0 > max {d'b : lower <= b <= upper} is a proof. The direction
-    is the residual of the nearest point, from the same engine on  min 1/2 |x|^2 + 1/(2 eps) |s|^2,
-    lower <= v0 + Ct x + s <= upper,  which always has a solution; it is then checked, whoever found it.
-    """
-    scale = float(torch.linalg.matrix_norm(Ct, ord=2)) if Ct.numel() else 0.0
-    for eps in (1e-6, 1e-9, 1e-12):
-        soft = eps**0.5 * max(scale, 1e-12) * torch.eye(len(v0), dtype=Ct.dtype)
-        model = _set_up(torch.cat([Ct.cpu(), soft], dim=1))
-        sense = np.zeros(len(v0), dtype=np.int32)
-        lam, flag, _ = _solve_one(model, (lower - v0).cpu().numpy(), (upper - v0).cpu().numpy(), sense)
-        if flag == SOLVED_FLAG and _is_certificate(torch.from_numpy(lam).to(Ct), Ct, v0, lower, upper):
-            return True
-    return False
-
-
-def _is_certificate(d: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> bool:
-    d = d / torch.linalg.vector_norm(d).clamp_min(torch.finfo(d.dtype).tiny)
-    if Ct.numel():
-        left, singular, _ = torch.linalg.svd(Ct, full_matrices=False)
-        span = left[:, singular > DEPENDENT * singular[0]]
-        d = torch.where(d == 0, d, d - span @ (span.T @ d))  # rows without a bound must stay out of it
-        leak = torch.linalg.vector_norm(Ct.T @ d)
-    else:
-        leak = d.new_zeros(())
-    used = d != 0
-    support = torch.where(d > 0, d * upper, d * lower)[used].sum()
-    margin = (d * v0)[used].sum() - support
-    size = torch.linalg.vector_norm(v0) + torch.linalg.vector_norm(torch.where(d > 0, upper, lower)[used])
-    # A leak means that a v0 + Ct x with |x| > margin / leak is not excluded: demand it absurdly far away.
-    return bool(margin > 1e-9 * size) and bool(leak * 1e6 * (1 + size) < margin)
-
-
-#: Directions of Ct below this fraction of the largest are none.
-DEPENDENT = 1e-10
+def _by_qr(G: Tensor, Ct: Tensor, rows: np.ndarray, rhs: np.ndarray) -> np.ndarray:
+    """Return the multipliers of nearly dependent rows."""
+    active = torch.zeros(1, len(G), dtype=torch.bool, device=G.device)
+    right = G.new_zeros(1, len(G))
+    active[0, rows], right[0, rows] = True, torch.from_numpy(rhs).to(G.device)
+    return solve_active(G, Ct, active, right)[0][0].cpu().numpy()[rows]

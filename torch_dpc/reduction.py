@@ -18,7 +18,9 @@ of E with `TIE_BREAK`, and `Reduction.is_selection` says so.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, fields, replace
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,6 +33,8 @@ COST_RANK_TOLERANCE = 1e-11
 #: Weight on the kernel of E, relative to the largest singular value of E. Its square, 1e-10, is how far from the
 #: optimum (in relative cost curvature) the selected solution may be.
 TIE_BREAK = 1e-5
+#: How far u_ini may be from what the data can produce, relative to its norm.
+REACHABLE = 1e-8
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,6 +76,15 @@ class DataRows:
     u_ini_range: Tensor | None
     rank_W: int
 
+    def unreachable(self, theta: Tensor) -> Tensor:
+        """Return which samples `(B,)` ask for a u_ini that no combination of the data produces."""
+        u_ini = theta[..., : self.Up.shape[0]]
+        if self.u_ini_range is None:
+            return torch.zeros(u_ini.shape[:-1], dtype=torch.bool, device=u_ini.device)
+        missed = u_ini - (u_ini @ self.u_ini_range) @ self.u_ini_range.mT
+        norm = torch.linalg.vector_norm
+        return norm(missed, dim=-1) > REACHABLE * norm(u_ini, dim=-1)
+
     @staticmethod
     def of(data: HankelData, device: torch.device) -> DataRows:
         """Return the rows of the data; a graph behind the data matrices reaches through."""
@@ -111,6 +124,29 @@ class Reduction:
     rows: DataRows
     weights: Weights
     is_selection: bool
+
+    def detach(self) -> Reduction:
+        """Return the same numbers without their graph."""
+        rows = _map_tensors(self.rows, Tensor.detach)
+        weights = _map_tensors(self.weights, Tensor.detach)
+        return replace(_map_tensors(self, Tensor.detach), rows=rows, weights=weights)
+
+    def of_samples(self, samples: Tensor) -> Reduction:
+        """Return the problems of some samples, where there is one problem a sample; itself otherwise."""
+        if self.G.ndim == 2:
+            return self
+        weights = _map_tensors(self.weights, lambda tensor: tensor[samples])
+        return replace(_map_tensors(self, lambda tensor: tensor[samples]), weights=weights)
+
+
+def _map_tensors(holder: Any, change: Callable[[Tensor], Tensor]) -> Any:
+    """Return a copy of a dataclass with its tensors changed."""
+    changed = {f.name: change(getattr(holder, f.name)) for f in fields(holder) if _is_tensor(getattr(holder, f.name))}
+    return replace(holder, **changed)
+
+
+def _is_tensor(value: Any) -> bool:
+    return isinstance(value, Tensor)
 
 
 def reduce(rows: DataRows, weights: Weights) -> Reduction:

@@ -1,0 +1,54 @@
+"""A proof that a sample has no solution."""
+
+from __future__ import annotations
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .dual_active_set import SOLVED_FLAG, Daqp
+
+#: Directions of Ct below this fraction of the largest are none.
+DEPENDENT = 1e-10
+#: By how much the certificate must separate, relative to the size of v0 and of the bounds.
+MARGIN = 1e-9
+#: A certificate whose Ct'd is not quite zero excludes only |x| below this, relative to the size of the problem.
+FAR = 1e6
+
+
+def infeasibility_certificate(Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> bool:
+    """Return whether one sample is proven to have no v = v0 + Ct x between its bounds.
+
+    By Farkas' lemma a direction d with Ct' d = 0 and d'v0 > max {d'b : lower <= b <= upper} is a proof. The direction
+    is the residual of the nearest point,  min 1/2 |x|^2 + 1/(2 eps) |s|^2,  lower <= v0 + Ct x + s <= upper,  which
+    always exists; it is checked afterwards, whoever found it.
+
+    Args:
+        Ct: `(N, n_x)`.
+        v0, lower, upper: `(N,)`.
+    """
+    Ct, v0, lower, upper = (x.detach().cpu() for x in (Ct, v0, lower, upper))
+    left, singular, _ = torch.linalg.svd(Ct, full_matrices=False)
+    largest = float(singular.max()) if singular.numel() else 0.0
+    span = left[:, singular > DEPENDENT * largest]
+    no_equality = np.zeros(len(v0), dtype=bool)
+    for eps in (1e-6, 1e-9, 1e-12):
+        soft = eps**0.5 * max(largest, 1e-12) * torch.eye(len(v0), dtype=Ct.dtype)
+        workspace = Daqp(torch.cat([Ct, soft], dim=1))
+        lam, flag, _ = workspace.solve((lower - v0).numpy(), (upper - v0).numpy(), no_equality)
+        if flag == SOLVED_FLAG and _separates(torch.from_numpy(lam), Ct, span, v0, lower, upper):
+            return True
+    return False
+
+
+def _separates(d: Tensor, Ct: Tensor, span: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> bool:
+    norm = torch.linalg.vector_norm
+    d = d / norm(d).clamp_min(torch.finfo(d.dtype).tiny)
+    d = torch.where(d == 0, d, d - span @ (span.T @ d))  # rows without a bound must stay out of it
+    used = d != 0
+    bound = torch.where(d > 0, upper, lower)[used]
+    margin = (d * v0)[used].sum() - (d[used] * bound).sum()
+    size = norm(v0) + norm(bound)
+    leak = norm(Ct.T @ d)
+    # x with |x| > margin / leak are not excluded: demand that they be absurdly far away.
+    return bool(margin > MARGIN * size) and bool(margin > FAR * (1 + size) * leak)

@@ -1,0 +1,268 @@
+"""The data-driven predictive control problem as a torch module."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor, nn
+from torch.autograd import forward_ad
+
+from .checks import as_data
+from .errors import Status
+from .function import SolveReduced
+from .hankel import HankelData
+from .linear import times
+from .problem import CompactForm, Sizes, compact_form, penalty, stacked_bounds, weight_matrix
+from .reduction import DataRows, Reduction, Weights, reduce
+from .sets import Box, ConvexSet, Reals
+from .solution import DPCSolution, SolveInfo
+from .solve import Solver
+
+
+class DPCLayer(nn.Module):
+    """Plan a trajectory of the recorded system by one quadratic program, differentiably.
+
+        minimise over u, y, g   1/2 |y - y_ref|_Q^2 + 1/2 |u - u_ref|_R^2 + lambda_g |M g|^2 + lambda_s |Yp g - y_ini|^2
+        subject to              Up g = u_ini,  u = Uf g,  y = Yf g,  u in U,  y in Y,
+
+    M = I - W^+ W, W = [Up; Yp; Uf] (Yu, Zhao, Chinchali, Topcu). The data are factored once, when they and the weights
+    are first used; a call then costs a matrix product and small solves, whatever the number of recorded windows.
+
+    Args:
+        data: the recorded trajectories.
+        Q: output weight, positive semidefinite: a number, `(n_y, n_y)`, or `(horizon n_y, horizon n_y)`.
+        R: input weight, likewise.
+        lambda_g: regularisation of the part of g that the past and the future input do not explain.
+        lambda_s: penalty on the mismatch of the initial output.
+        u_set, y_set: constraints on every step's input and output; `None` for none.
+        backward: "reduced", the exact reduced system, or "full", the paper's projected KKT system.
+        solver: the forward engine: "newton" (batched), "daqp" (one by one), or "auto".
+        on_failure: "raise", or "nan" to mark samples that have no solution and return the others.
+
+    Weights may be numbers, tensors or parameters. An `nn.Parameter` is registered and learns; a tensor that carries a
+    graph keeps it.
+
+    Raises:
+        ValueError: bad input, named.
+
+    Example:
+        >>> u = torch.rand(60, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) - 0.5
+        >>> data = HankelData.from_trajectories(u, u.cumsum(0) - u, t_ini=2, horizon=5)   # an integrator
+        >>> layer = DPCLayer(data, Q=1.0, R=0.1, lambda_g=1.0, lambda_s=1e3, u_set=Box(-0.3, 0.3))
+        >>> sol = layer(torch.zeros(2, 1), torch.zeros(2, 1), y_ref=torch.ones(1))
+        >>> sol.u.shape, int(sol.info.status), int(sol.info.n_active)
+        (torch.Size([5, 1]), 0, 3)
+    """
+
+    def __init__(
+        self,
+        data: HankelData,
+        Q: Any,
+        R: Any,
+        lambda_g: Any,
+        lambda_s: Any,
+        u_set: ConvexSet | None = None,
+        y_set: ConvexSet | None = None,
+        *,
+        backward: str = "reduced",
+        solver: str = "auto",
+        on_failure: str = "raise",
+    ):
+        super().__init__()
+        _check_choice("backward", backward, ("reduced", "full"))
+        _check_choice("solver", solver, ("auto", "newton", "daqp"))
+        _check_choice("on_failure", on_failure, ("raise", "nan"))
+        if not isinstance(data, HankelData):
+            raise ValueError(f"`data` must be a HankelData, got {type(data).__name__}.")
+        self.data = data
+        self.Q, self.R, self.lambda_g, self.lambda_s = Q, R, lambda_g, lambda_s
+        self.u_set = Reals() if u_set is None else u_set
+        self.y_set = Reals() if y_set is None else y_set
+        for name, value in (("u_set", self.u_set), ("y_set", self.y_set)):
+            if not isinstance(value, Box):
+                raise ValueError(f"`{name}` must be a Box, Reals or None, got {type(value).__name__}.")
+        self.backward_system = backward
+        self.solver = solver
+        self.on_failure = on_failure
+        self.sizes = Sizes.of(data)
+        self._cache: dict[tuple[str, torch.device], Any] = {}
+        self._weights(torch.device("cpu"))  # bad weights and bounds are told now, not at the first call
+        stacked_bounds(self.u_set, self.y_set, data, torch.device("cpu"))
+
+    @property
+    def reduced_kkt_size(self) -> int:
+        """Unknowns of the system that the reduced backward solves: horizon (n_u + n_y)."""
+        return self.data.horizon * (self.data.n_u + self.data.n_y)
+
+    @property
+    def full_kkt_size(self) -> int:
+        """Unknowns of the paper's system: 2 horizon (n_u + n_y) + t_ini n_u + n_g."""
+        return 2 * self.reduced_kkt_size + self.data.t_ini * self.data.n_u + self.data.n_g
+
+    def forward(self, u_ini: Any, y_ini: Any, *, y_ref: Any = None, u_ref: Any = None) -> DPCSolution:
+        """Plan from the last `t_ini` inputs and outputs.
+
+        Args:
+            u_ini: past inputs, `(*batch, t_ini, n_u)`.
+            y_ini: past outputs, `(*batch, t_ini, n_y)`.
+            y_ref, u_ref: references, broadcast to `(*batch, horizon, n)`; zero by default.
+
+        Returns:
+            The plan, in the dtype and on the device of the measurements.
+
+        Raises:
+            ValueError: shapes that do not fit, or values that are not finite.
+            InfeasibleError: a sample has no solution, provably (with `on_failure="raise"`).
+            SolveError: a sample could not be solved (likewise).
+        """
+        theta, dtype = self._theta(u_ini, y_ini, y_ref, u_ref)
+        reduction, solver = self._factors(theta.device)
+        lower, upper = self._bounds(theta.device)
+        v, lam, _, info = SolveReduced.apply(theta, reduction.V, reduction.G, reduction.Ct, lower, upper, solver)
+        u, y = v.split((self.sizes.u, self.sizes.y), dim=-1)
+        u, y = u.unflatten(-1, (self.data.horizon, -1)), y.unflatten(-1, (self.data.horizon, -1))
+        return DPCSolution(
+            u=u.to(dtype),
+            y=y.to(dtype),
+            info=SolveInfo(info, reduction.is_selection),
+            lam=lam,
+            _make_g=lambda: self._g(reduction, theta, lam, info).to(dtype),
+        )
+
+    def compact_form(self, u_ini: Any, y_ini: Any, *, y_ref: Any = None, u_ref: Any = None) -> CompactForm:
+        """Return the problem as the paper writes it, minimise 1/2 z'Pz + q'z subject to H z = b, z in D.
+
+        The arguments are those of the call. P is `(n, n)`, q `(*batch, n)`, H `(m, n)`, b `(*batch, m)`, float64.
+        """
+        theta, _ = self._theta(u_ini, y_ini, y_ref, u_ref)
+        weights = self._weights(theta.device)
+        if weights.Q.ndim + weights.R.ndim + weights.lambda_g.ndim + weights.lambda_s.ndim > 4:
+            raise ValueError("`compact_form` takes one problem; the weights have a batch dimension.")
+        return compact_form(self.data, weights, theta)
+
+    def extra_repr(self) -> str:
+        """Describe the data and the sizes of the systems that are solved."""
+        return (
+            f"{self.data!r}, reduced_kkt_size={self.reduced_kkt_size}, full_kkt_size={self.full_kkt_size}, "
+            f"backward={self.backward_system!r}, solver={self.solver!r}, on_failure={self.on_failure!r}"
+        )
+
+    def _theta(self, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any) -> tuple[Tensor, torch.dtype]:
+        """Return (u_ini, y_ini, u_ref, y_ref) flattened, `(*batch, n_theta)` in float64, and the caller's dtype."""
+        data = self.data
+        u_ini = _window("u_ini", u_ini, data.t_ini, data.n_u, "n_u")
+        y_ini = _window("y_ini", y_ini, data.t_ini, data.n_y, "n_y")
+        parts = [
+            u_ini,
+            y_ini,
+            _reference("u_ref", u_ref, data.horizon, data.n_u, "n_u", u_ini),
+            _reference("y_ref", y_ref, data.horizon, data.n_y, "n_y", y_ini),
+        ]
+        shapes = [part.shape[:-2] for part in parts]
+        if any(shape != shapes[0] for shape in shapes):
+            try:
+                batch = torch.broadcast_shapes(*shapes)
+            except RuntimeError as error:
+                names = ("u_ini", "y_ini", "u_ref", "y_ref")
+                came = ", ".join(f"{name} {tuple(shape)}" for name, shape in zip(names, shapes, strict=True))
+                raise ValueError(f"the batch shapes must broadcast, got {came}.") from error
+            parts = [part.expand(*batch, *part.shape[-2:]) for part in parts]
+        dtype = torch.promote_types(u_ini.dtype, y_ini.dtype)
+        return torch.cat([part.flatten(-2).double() for part in parts], dim=-1), dtype
+
+    def _weights(self, device: torch.device) -> Weights:
+        """Return the weights as float64 tensors of the whole horizon, with their graph."""
+        data = self.data
+        return Weights(
+            Q=weight_matrix("Q", self.Q, data.n_y, data.horizon).to(device),
+            R=weight_matrix("R", self.R, data.n_u, data.horizon).to(device),
+            lambda_g=penalty("lambda_g", self.lambda_g).to(device),
+            lambda_s=penalty("lambda_s", self.lambda_s).to(device),
+        )
+
+    def _bounds(self, device: torch.device) -> tuple[Tensor, Tensor]:
+        sources = (self.u_set.lower, self.u_set.upper, self.y_set.lower, self.y_set.upper)
+        if _carries_derivative(sources):
+            return stacked_bounds(self.u_set, self.y_set, self.data, device)
+        return self._cached("bounds", device, sources, stacked_bounds, self.u_set, self.y_set, self.data, device)
+
+    def _factors(self, device: torch.device) -> tuple[Reduction, Solver]:
+        sources = (self.Q, self.R, self.lambda_g, self.lambda_s, *self.data.matrices)
+        if _carries_derivative(sources):
+            return self._factor(device)
+        # The matrices of the data are constants of a frozen object: the object stands for them.
+        return self._cached("factors", device, (*sources[:4], self.data), self._factor, device)
+
+    def _factor(self, device: torch.device) -> tuple[Reduction, Solver]:
+        reduction = reduce(DataRows.of(self.data, device), self._weights(device))
+        return reduction, Solver(reduction.detach(), self.sizes, self.solver, self.on_failure)
+
+    def _cached(self, name: str, device: torch.device, sources: tuple[Any, ...], make: Any, *args: Any) -> Any:
+        """Return what `make` makes of the sources, made anew when their *values* have changed.
+
+        Version counters would be cheaper, but they miss edits through `.data` and optimisers that use it.
+        """
+        entry = self._cache.get((name, device))
+        if entry is None or not all(map(_is_same, entry[0], sources)):
+            with torch.no_grad():
+                kept = tuple(s.detach().clone() if isinstance(s, Tensor) else s for s in sources)
+                entry = self._cache[name, device] = (kept, make(*args))
+        return entry[1]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Leave the factors out of copies and pickles: they are made again when needed."""
+        return {**self.__dict__, "_cache": {}}
+
+    def _g(self, reduction: Reduction, theta: Tensor, lam: Tensor, info: Tensor) -> Tensor:
+        a = times(reduction.A_theta, theta) - times(reduction.A_lam, lam)
+        basis = self.data.row_space.basis.to(a.device)
+        if reduction.rows.C.requires_grad:  # g = D^+ (D g), so that the data behind D are differentiated too
+            D = torch.cat([m.to(a) for m in self.data.matrices])
+            g = (a @ (D.detach() @ basis).mT) @ torch.linalg.pinv(D, rtol=1e-10).mT
+        else:
+            g = a @ basis.mT
+        return torch.where(info[..., :1] == Status.SOLVED, g, torch.nan)
+
+
+def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
+    if value not in choices:
+        raise ValueError(f"`{name}` must be one of {', '.join(map(repr, choices))}, got {value!r}.")
+
+
+def _window(name: str, value: Any, steps: int, channels: int, symbol: str) -> Tensor:
+    tensor = as_data(name, value, finite=False)  # values are looked at inside the Function: here it would break vmap
+    if tensor.shape[-2:] != (steps, channels):
+        raise ValueError(
+            f"`{name}` must have shape (*batch, t_ini, {symbol}) = (*, {steps}, {channels}), "
+            f"got {tuple(tensor.shape)}."
+        )
+    return tensor
+
+
+def _reference(name: str, value: Any, steps: int, channels: int, symbol: str, like: Tensor) -> Tensor:
+    if value is None:
+        return like.new_zeros(()).expand(steps, channels)
+    tensor = as_data(name, value, finite=False)
+    tail = tensor.shape[-2:]
+    if tensor.ndim == 0 or tail[-1] != channels or (len(tail) == 2 and tail[0] not in (1, steps)):
+        raise ValueError(
+            f"`{name}` must broadcast to (*batch, horizon, {symbol}) = (*, {steps}, {channels}), "
+            f"got {tuple(tensor.shape)}."
+        )
+    tensor = tensor.to(like.device)
+    return tensor.expand(steps, channels) if tensor.ndim == 1 else tensor.expand(*tensor.shape[:-2], steps, channels)
+
+
+def _carries_derivative(sources: tuple[Any, ...]) -> bool:
+    """Return whether a derivative, backward or forward, may be asked with respect to one of the sources."""
+    tensors = [s for s in sources if isinstance(s, Tensor)]
+    if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):
+        return True
+    return any(forward_ad.unpack_dual(t).tangent is not None for t in tensors)
+
+
+def _is_same(kept: Any, now: Any) -> bool:
+    if isinstance(kept, Tensor) and isinstance(now, Tensor):
+        return kept.shape == now.shape and kept.dtype == now.dtype and torch.equal(kept.to(now.device), now)
+    return kept is now or (isinstance(kept, (int, float)) and isinstance(now, (int, float)) and kept == now)

@@ -1,0 +1,197 @@
+"""The forward solve: choose an engine, judge each sample by the paper's own optimality map, name what failed."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
+from typing import NamedTuple
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from .checks import as_data, is_finite
+from .dual_active_set import SOLVED_FLAG, Daqp, solve_daqp
+from .errors import InfeasibleError, SolveError, Status
+from .infeasibility import infeasibility_certificate
+from .linear import times
+from .newton import ActiveSetResult, solve_newton
+from .optimality import BATCHED, SINGLE, Optimality
+from .problem import Sizes
+from .reduction import Reduction
+
+#: A sample is accepted when F, relative to its own terms, is at most this.
+ACCEPTED = 1e-8
+#: DAQP's own multipliers are taken as they are up to this residual, and polished above it.
+AS_GOOD_AS_POLISHED = 1e-11
+#: Up to this many samples on the CPU, NumPy and DAQP take one after the other.
+FEW = 3
+#: On the CPU, DAQP takes batches up to this size and Newton larger ones.
+DAQP_BATCH = 16
+
+Engine = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], ActiveSetResult]
+
+
+class Solved(NamedTuple):
+    """The solution of a batch of reduced problems.
+
+    Attributes:
+        v: the constrained rows (u, y), within their bounds, `(B, N)`; NaN where there is no solution.
+        lam: their multipliers, `(B, N)`; zero where there is no solution.
+        active: the rows that count as active in derivatives, `(B, N)`, boolean.
+        info: status, iterations, residual, n_active, n_weakly_active of each sample, `(B, 5)`.
+    """
+
+    v: Tensor
+    lam: Tensor
+    active: Tensor
+    info: Tensor
+
+    @property
+    def failed(self) -> Tensor:
+        """Which samples have no accepted solution, `(B,)`."""
+        return self.info[..., 0] != Status.SOLVED
+
+
+@dataclass(frozen=True, eq=False)
+class Solver:
+    """Everything a solve needs besides its tensors.
+
+    Attributes:
+        reduction: the reduced problem, without a graph.
+        sizes: the parts of theta.
+        engine: "auto", "newton" or "daqp".
+        on_failure: "raise" or "nan".
+    """
+
+    reduction: Reduction
+    sizes: Sizes
+    engine: str
+    on_failure: str
+
+    @cached_property
+    def _batched(self) -> Optimality:
+        return Optimality(self.reduction, BATCHED)
+
+    @cached_property
+    def _single(self) -> Optimality:
+        return Optimality(self.reduction, SINGLE)
+
+    @cached_property
+    def _daqp(self) -> Daqp | None:
+        return Daqp(self.reduction.Ct) if self.reduction.Ct.ndim == 2 else None
+
+    def solve(self, theta: Tensor, lower: Tensor, upper: Tensor, batch: torch.Size) -> Solved:
+        """Solve for every theta `(B, n_theta)`.
+
+        Args:
+            theta: (u_ini, y_ini, u_ref, y_ref), float64.
+            lower, upper: bounds `(N,)` or `(B, N)`.
+            batch: the caller's batch shape, to name samples in errors.
+
+        Raises:
+            ValueError: values that are not finite.
+            InfeasibleError, SolveError: with `on_failure="raise"`, if a sample has no accepted solution.
+        """
+        daqp_first = self._is_daqp_first(theta)
+        if daqp_first and len(theta) <= FEW and theta.device.type == "cpu" and lower.ndim == 1 and self._daqp:
+            quick = self._one_by_one(theta.numpy(), lower.numpy(), upper.numpy())
+            if quick is not None:
+                return quick
+        self._check_finite(theta)
+        solved = self._attempt(self._engine(daqp_first), theta, lower, upper)
+        failed = solved.failed
+        if bool(failed.any()):
+            rest = failed.nonzero()[:, 0]
+            problem = (theta[rest], _take(lower, rest), _take(upper, rest))
+            subset = replace(self, reduction=self.reduction.of_samples(rest))
+            retried = subset._attempt(subset._engine(not daqp_first), *problem)
+            for whole, part in zip(solved, retried, strict=True):
+                whole[rest] = part
+            subset._mark_failures(solved, rest, *problem)
+            self._report(solved, batch)
+        return solved
+
+    def _check_finite(self, theta: Tensor) -> None:
+        if is_finite(theta):
+            return
+        for name, part in zip(("u_ini", "y_ini", "u_ref", "y_ref"), theta.split(self.sizes.theta, dim=-1), strict=True):
+            as_data(name, part)
+
+    def _is_daqp_first(self, theta: Tensor) -> bool:
+        """DAQP is faster for a few problems with one matrix, Newton for many; `scripts/benchmark.py` shows where."""
+        suits = theta.device.type == "cpu" and len(theta) <= DAQP_BATCH and self._daqp is not None
+        return self.engine == "daqp" or (self.engine == "auto" and suits)
+
+    def _engine(self, daqp: bool) -> Engine:
+        return partial(solve_daqp, workspace=self._daqp) if daqp else solve_newton
+
+    def _attempt(self, engine: Engine, theta: Tensor, lower: Tensor, upper: Tensor) -> Solved:
+        """Run one engine on the batch and judge what it found."""
+        a0, v0 = self._batched.unconstrained(theta)
+        found = engine(self.reduction.G, self.reduction.Ct, v0, lower, upper)
+        judged = self._batched.judge(theta, a0, v0, found.lam, lower, upper)
+        failed = ~(found.converged & (judged.residual <= ACCEPTED))
+        info = [failed * Status.FAILED, found.iterations, judged.residual, judged.n_active, judged.n_weakly_active]
+        return Solved(judged.v, found.lam, judged.active, torch.stack([i.double() for i in info], dim=-1))
+
+    def _one_by_one(self, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> Solved | None:
+        """Run DAQP and judge its own multipliers, in NumPy; None if one sample does not convince."""
+        assert self._daqp is not None
+        tight = lower == upper
+        v, lam = np.empty((len(theta), len(lower))), np.empty((len(theta), len(lower)))
+        active, info = np.empty(v.shape, dtype=bool), np.empty((len(theta), 5))
+        for i, sample in enumerate(theta):
+            a0, v0 = self._single.unconstrained(sample)
+            lam[i], flag, iterations = self._daqp.solve(lower - v0, upper - v0, tight)
+            v[i], residual, active[i], n_active, n_weak = self._single.judge(sample, a0, v0, lam[i], lower, upper)
+            if not (flag == SOLVED_FLAG and residual <= AS_GOOD_AS_POLISHED):  # NaN is not either
+                return None
+            info[i] = Status.SOLVED, iterations, residual, n_active, n_weak
+        return Solved(*(torch.from_numpy(x) for x in (v, lam, active, info)))
+
+    def _mark_failures(self, solved: Solved, rest: Tensor, theta: Tensor, lower: Tensor, upper: Tensor) -> None:
+        """Look for certificates where both engines failed; leave NaN for v and nothing in the multipliers."""
+        Ct, unreachable = self.reduction.Ct, self.reduction.rows.unreachable(theta)
+        v0 = times(self.reduction.V, theta)
+        for k, i in enumerate(rest.tolist()):
+            if solved.info[i, 0] == Status.SOLVED:
+                continue
+            sample = (Ct if Ct.ndim == 2 else Ct[k], v0[k], _row(lower, k), _row(upper, k))
+            if bool(unreachable[k]) or infeasibility_certificate(*sample):
+                solved.info[i, 0] = Status.INFEASIBLE
+            solved.v[i] = torch.nan
+            for emptied in (solved.lam[i], solved.active[i], solved.info[i, 3:]):
+                emptied.zero_()
+
+    def _report(self, solved: Solved, batch: torch.Size) -> None:
+        failed = solved.failed.nonzero()[:, 0]
+        if self.on_failure == "nan" or len(failed) == 0:
+            return
+        infeasible = (solved.info[failed, 0] == Status.INFEASIBLE).tolist()
+        places = [tuple(int(j) for j in torch.unravel_index(i, batch)) if batch else () for i in failed]
+        where = f"batch {'index' if len(places) == 1 else 'indices'} {_listed(places)}" if batch else "the problem"
+        hint = 'on_failure="nan" marks such samples and returns the others.'
+        if all(infeasible):
+            why = "no trajectory meets the constraints (a u_ini that the data cannot produce, or bounds that exclude it)"
+            raise InfeasibleError(f"{where}: {why}. {hint}", places)
+        worst = float(solved.info[failed, 2].max())
+        raise SolveError(
+            f"{where}: no engine reached a residual of {ACCEPTED:g} (got {worst:.1e}), and {sum(infeasible)} of "
+            f"{len(places)} are proven infeasible. Badly scaled data or weights are the usual reason. {hint}",
+            places,
+        )
+
+
+def _listed(places: list[tuple[int, ...]], most: int = 10) -> str:
+    names = [str(p[0]) if len(p) == 1 else str(p) for p in places[:most]]
+    return ", ".join(names) + (f" and {len(places) - most} more" if len(places) > most else "")
+
+
+def _take(bound: Tensor, samples: Tensor) -> Tensor:
+    return bound if bound.ndim == 1 else bound[samples]
+
+
+def _row(bound: Tensor, sample: int) -> Tensor:
+    return bound if bound.ndim == 1 else bound[sample]

@@ -1,0 +1,6 @@
+"""Plants: anything with `n_u`, `n_y`, `dt`, `reset(...)` and `step(u)` is one."""
+
+from .masses import OscillatingMasses
+from .quadrotor import Quadrotor
+
+__all__ = ["OscillatingMasses", "Quadrotor"]
