@@ -10,7 +10,10 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from scipy.linalg.lapack import dposv
 from torch import Tensor
+
+from .linear import times
 
 #: Below this ratio of the extreme pivots a Cholesky factor of G[A, A] is not trusted.
 PIVOT_RATIO = 1e-5
@@ -45,6 +48,29 @@ def solve_active(G: Tensor, Ct: Tensor, active: Tensor, rhs: Tensor) -> tuple[Te
     return lam, trusted
 
 
+def adjoint(G: Tensor, Ct: Tensor, active: Tensor, v_bar: Tensor, lam_bar: Tensor | None) -> Tensor:
+    """Return v0_bar = v_bar + s, s_A = G_AA^-1 (lam_bar - G v_bar)_A; the arguments are those of `solve_active`."""
+    if v_bar.device.type == "cpu" and len(v_bar) <= FEW and G.ndim == 2:
+        out = v_bar.clone()
+        few = _adjoint_few(G.numpy(), active.numpy(), out.numpy(), None if lam_bar is None else lam_bar.numpy())
+        if few:
+            return out
+    rhs = -times(G, v_bar)
+    return v_bar + solve_active(G, Ct, active, rhs if lam_bar is None else rhs + lam_bar)[0]
+
+
+def _adjoint_few(G: np.ndarray, active: np.ndarray, bar: np.ndarray, lam_bar: np.ndarray | None) -> bool:
+    """Turn v_bar into v0_bar in place; False where a system cannot be trusted."""
+    for i, v_bar in enumerate(bar):
+        rows = active[i].nonzero()[0]
+        rhs = -(G[rows] @ v_bar)
+        s = solve_rows(G, rows, rhs if lam_bar is None else rhs + lam_bar[i, rows])
+        if s is None:
+            return False
+        v_bar[rows] += s
+    return True
+
+
 def _where_not(flags: Tensor) -> list[int]:
     return [] if bool(flags.all()) else (~flags).nonzero()[:, 0].tolist()
 
@@ -66,14 +92,12 @@ def solve_rows(G: np.ndarray, rows: np.ndarray, rhs: np.ndarray) -> np.ndarray |
     """Return G[rows, rows]^-1 rhs, or None where Cholesky says that G cannot be trusted with it."""
     if len(rows) == 0:
         return rhs
-    block = G[rows[:, None], rows]
-    try:
-        pivots = np.linalg.cholesky(block).diagonal()
-    except np.linalg.LinAlgError:
+    # LAPACK itself: the wrappers of NumPy and torch cost several times a system of this size.
+    factor, solution, failed = dposv(G[rows[:, None], rows], rhs)
+    pivots = factor.diagonal()
+    if failed or not pivots.min() > PIVOT_RATIO * pivots.max():
         return None
-    if not pivots.min() > PIVOT_RATIO * pivots.max():
-        return None
-    return np.linalg.solve(block, rhs)
+    return solution
 
 
 def _packed(G: Tensor, active: Tensor, rhs: Tensor) -> tuple[Tensor, Tensor]:

@@ -7,7 +7,7 @@ At a solution  v = v0 - G lam,  v0 = V theta,  with A the active rows and b thei
 the projected Karush-Kuhn-Tucker system of the paper after the reduction. A cotangent (v_bar, lam_bar) goes back by
 one system with the same symmetric matrix:
 
-    s_A = G_AA^-1 (lam_bar - G v_bar)_A,     v0_bar = v_bar + s,     b_bar = -s,     G_bar = -v0_bar lam',
+    s_A = G_AA^-1 (lam_bar - G v_bar)_A,     v0_bar = v_bar + s,     b_bar = -s_A,   G_bar = -v0_bar lam',
     theta_bar = V' v0_bar,                   V_bar = v0_bar theta'.
 
 Everything in the backward is differentiable again, the system included, so derivatives of any order come out.
@@ -15,14 +15,15 @@ Everything in the backward is differentiable again, the system included, so deri
 
 from __future__ import annotations
 
+import inspect
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from .active_set import solve_active
+from .active_set import adjoint, solve_active
 from .errors import Status
-from .linear import outer, times
+from .linear import outer, per_sample, times
 from .solve import Solver
 
 
@@ -33,21 +34,15 @@ class SolveReduced(torch.autograd.Function):
     def forward(
         theta: Tensor, V: Tensor, G: Tensor, Ct: Tensor, lower: Tensor, upper: Tensor, solver: Solver
     ) -> tuple[Tensor, ...]:
-        batch = theta.shape[:-1]
-
-        def flat(x: Tensor, tail: int) -> Tensor:
-            # Shared matrices and bounds stay shared; others get one leading dimension, as theta does.
-            return x if x.ndim == tail else x.expand(*batch, *x.shape[-tail:]).reshape(-1, *x.shape[-tail:])
-
-        solved = solver.solve(theta.reshape(-1, theta.shape[-1]), flat(lower, 1), flat(upper, 1), batch)
-        return tuple(x.reshape((*batch, *x.shape[1:])) for x in solved)
+        return tuple(solver.solve(theta, lower, upper))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        theta, V, G, Ct, lower, upper, _ = inputs
+        theta, V, G, Ct, lower, upper, solver = inputs
         _, lam, active, info = output
         ctx.mark_non_differentiable(active, info)
         ctx.set_materialize_grads(False)
+        ctx.may_fail = solver.on_failure != "raise"
         saved = (theta, V, G, Ct, lower, upper, lam, active, info)
         ctx.save_for_backward(*saved)
         ctx.save_for_forward(*saved)
@@ -55,21 +50,24 @@ class SolveReduced(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, v_bar: Tensor | None, lam_bar: Tensor | None, *_: Any) -> tuple[Tensor | None, ...]:
         theta, V, G, Ct, lower, upper, lam, active, info = ctx.saved_tensors
-        if v_bar is None and lam_bar is None:
-            return (None,) * 7
-        failed = info[..., :1] != Status.SOLVED
-        v_bar = torch.zeros_like(lam) if v_bar is None else torch.where(failed, 0.0, v_bar)
-        rhs = -times(G, v_bar)
-        if lam_bar is not None:
-            rhs = rhs + torch.where(failed, 0.0, lam_bar)
-        s = SolveActive.apply(rhs, active, G, Ct)
-        v0_bar = v_bar + s
+        if v_bar is None:
+            if lam_bar is None:
+                return (None,) * 7
+            v_bar = torch.zeros_like(lam)
+        if ctx.may_fail:  # samples without a solution add nothing, whatever came back for their NaN
+            solved = info[..., :1] == Status.SOLVED
+            v_bar = torch.where(solved, v_bar, 0.0)
+            lam_bar = None if lam_bar is None else torch.where(solved, lam_bar, 0.0)
+        v0_bar = SolveAdjoint.apply(v_bar, lam_bar, active, G, Ct)
         need = ctx.needs_input_grad
         theta_bar = times(V.mT, v0_bar) if need[0] else None
         V_bar = outer(v0_bar, theta, V) if need[1] else None
         G_bar = outer(-v0_bar, lam, G) if need[2] else None
-        lower_bar = torch.where(lam < 0, -s, 0.0).sum_to_size(lower.shape) if need[4] else None
-        upper_bar = torch.where(lam < 0, 0.0, -s).sum_to_size(upper.shape) if need[5] else None
+        lower_bar = upper_bar = None
+        if need[4] or need[5]:
+            b_bar = torch.where(active, v_bar - v0_bar, 0.0)
+            lower_bar = torch.where(lam < 0, b_bar, 0.0).sum_to_size(lower.shape)
+            upper_bar = torch.where(lam < 0, 0.0, b_bar).sum_to_size(upper.shape)
         return theta_bar, V_bar, G_bar, None, lower_bar, upper_bar, None
 
     @staticmethod
@@ -108,12 +106,50 @@ class SolveReduced(torch.autograd.Function):
                 "vmap over weights or data is not supported: give the layer weights with a leading batch dimension, "
                 "which share one batched factorisation."
             )
-        theta = _lead(theta, in_dims[0], info.batch_size, None, 1)
-        depth = theta.ndim - 1
-        lower = _lead(lower, in_dims[4], None, depth, 1)
-        upper = _lead(upper, in_dims[5], None, depth, 1)
+        theta, lower, upper = _lead_all(
+            (theta, lower, upper), (in_dims[0], in_dims[4], in_dims[5]), (1, 1, 1), info.batch_size
+        )
         outputs = SolveReduced.apply(theta, V, G, Ct, lower, upper, solver)
         return outputs, (0,) * len(outputs)
+
+
+class SolveAdjoint(torch.autograd.Function):
+    """(v_bar, lam_bar, active, G, Ct) -> v0_bar = v_bar + S (lam_bar - G v_bar), S = E_A G_AA^-1 E_A'."""
+
+    @staticmethod
+    def forward(v_bar: Tensor, lam_bar: Tensor | None, active: Tensor, G: Tensor, Ct: Tensor) -> Tensor:
+        n, batch = v_bar.shape[-1], v_bar.shape[:-1]
+        bars = [None if bar is None else bar.reshape(-1, n) for bar in (v_bar, lam_bar)]
+        rows = active.expand(v_bar.shape).reshape(-1, n)
+        return adjoint(per_sample(G, 2, batch), per_sample(Ct, 2, batch), rows, *bars).reshape(v_bar.shape)
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
+        _, _, active, G, Ct = inputs
+        ctx.save_for_backward(active, G, Ct, output)
+        ctx.save_for_forward(active, G, Ct, output)
+
+    @staticmethod
+    def backward(ctx: Any, bar: Tensor) -> tuple[Tensor | None, ...]:
+        active, G, Ct, v0_bar = ctx.saved_tensors
+        need = ctx.needs_input_grad
+        s = SolveActive.apply(bar, active, G, Ct)
+        v_bar_bar = bar - times(G, s) if need[0] else None
+        return v_bar_bar, s if need[1] else None, None, outer(-s, v0_bar, G) if need[3] else None, None
+
+    @staticmethod
+    def jvp(ctx: Any, v_t: Tensor | None, lam_t: Tensor | None, _active: Any, G_t: Tensor | None, _Ct: Any) -> Tensor:
+        active, G, Ct, v0_bar = ctx.saved_tensors
+        v_t = torch.zeros_like(v0_bar) if v_t is None else v_t
+        if G_t is not None:
+            lam_t = -times(G_t, v0_bar) + (0.0 if lam_t is None else lam_t)
+        return SolveAdjoint.apply(v_t, lam_t, active, G, Ct)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Tensor, int]:
+        v_bar, lam_bar, *shared = args
+        lifted = _lead_all((v_bar, lam_bar, *shared), in_dims, (1, 1, 1, 2, 2), info.batch_size)
+        return SolveAdjoint.apply(*lifted), 0
 
 
 class SolveActive(torch.autograd.Function):
@@ -121,14 +157,9 @@ class SolveActive(torch.autograd.Function):
 
     @staticmethod
     def forward(rhs: Tensor, active: Tensor, G: Tensor, Ct: Tensor) -> Tensor:
-        n = rhs.shape[-1]
-        batch = rhs.shape[:-1]
-
-        def flat(x: Tensor) -> Tensor:
-            return x if x.ndim == 2 else x.expand(*batch, *x.shape[-2:]).reshape(-1, *x.shape[-2:])
-
-        rows = active.expand(*batch, n).reshape(-1, n)
-        s, _ = solve_active(flat(G), flat(Ct), rows, rhs.reshape(-1, n))
+        n, batch = rhs.shape[-1], rhs.shape[:-1]
+        rows = active.expand(rhs.shape).reshape(-1, n)
+        s, _ = solve_active(per_sample(G, 2, batch), per_sample(Ct, 2, batch), rows, rhs.reshape(-1, n))
         return s.reshape(rhs.shape)
 
     @staticmethod
@@ -154,24 +185,33 @@ class SolveActive(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], *args: Tensor) -> tuple[Tensor, int]:
-        rhs, active, G, Ct = args
-        depth = max(
-            x.ndim - (dim is not None) - 1 for x, dim in ((rhs, in_dims[0]), (active, in_dims[1]))
-        )  # batch dimensions without the mapped one
-        rhs = _lead(rhs, in_dims[0], info.batch_size, depth + 1, 1)
-        active = _lead(active, in_dims[1], None, depth + 1, 1)
-        G = _lead(G, in_dims[2], None, depth + 1, 2)
-        Ct = _lead(Ct, in_dims[3], None, depth + 1, 2)
-        return SolveActive.apply(rhs, active, G, Ct), 0
+        return SolveActive.apply(*_lead_all(args, in_dims, (1, 1, 2, 2), info.batch_size)), 0
 
 
-def _lead(x: Tensor, dim: int | None, size: int | None, depth: int | None, tail: int) -> Tensor:
-    """Bring a mapped dimension to the front, ahead of `depth - 1` batch dimensions and `tail` of its own.
+# `apply` binds its arguments by the signature of `forward` at every call; finding it anew each time costs 15 us.
+for _function in (SolveReduced, SolveAdjoint, SolveActive):
+    setattr(_function.forward, "__signature__", inspect.signature(_function.forward))  # noqa: B010
 
-    A tensor that is not mapped broadcasts as it is, or is expanded to `size` where one is given.
+
+def _lead_all(
+    tensors: tuple[Tensor | None, ...], dims: tuple[int | None, ...], tails: tuple[int, ...], size: int
+) -> list[Tensor | None]:
+    """Bring the mapped dimension of each tensor to the front, so that all broadcast as one batch.
+
+    Args:
+        tensors: the first carries the batch, and is expanded where it is not mapped itself.
+        dims: the mapped dimension of each, or None.
+        tails: how many dimensions at the end are a tensor's own.
+        size: of the mapped dimension.
     """
-    if dim is None:
-        return x if size is None else x.expand(size, *x.shape)
-    x = x.movedim(dim, 0)
-    missing = 0 if depth is None else depth + tail - x.ndim
-    return x.reshape(x.shape[0], *(1,) * missing, *x.shape[1:])
+    pairs = list(zip(tensors, dims, tails, strict=True))
+    depth = max(x.ndim - (dim is not None) - tail for x, dim, tail in pairs if x is not None)
+    out: list[Tensor | None] = []
+    for place, (x, dim, tail) in enumerate(pairs):
+        if x is not None and dim is not None:
+            x = x.movedim(dim, 0)
+            x = x.reshape(x.shape[0], *(1,) * (depth + 1 + tail - x.ndim), *x.shape[1:])
+        elif x is not None and place == 0:
+            x = x.expand(size, *(1,) * (depth + tail - x.ndim), *x.shape)
+        out.append(x)
+    return out

@@ -15,3 +15,8 @@ def outer(y: Tensor, x: Tensor, like: Tensor) -> Tensor:
     if like.ndim == 2:
         return y.reshape(-1, y.shape[-1]).mT @ x.reshape(-1, x.shape[-1])
     return (y[..., :, None] * x[..., None, :]).sum_to_size(like.shape)
+
+
+def per_sample(x: Tensor, tail: int, batch: tuple[int, ...]) -> Tensor:
+    """Return a tensor with `tail` dimensions of its own for a flattened batch: shared as it is, or `(B, ...)`."""
+    return x if x.ndim == tail else x.expand(*batch, *x.shape[-tail:]).reshape(-1, *x.shape[-tail:])

@@ -15,7 +15,7 @@ from .checks import as_data, is_finite
 from .dual_active_set import SOLVED_FLAG, Daqp, solve_daqp
 from .errors import InfeasibleError, SolveError, Status
 from .infeasibility import infeasibility_certificate
-from .linear import times
+from .linear import per_sample, times
 from .newton import ActiveSetResult, solve_newton
 from .optimality import BATCHED, SINGLE, Optimality
 from .problem import Sizes
@@ -82,24 +82,31 @@ class Solver:
     def _daqp(self) -> Daqp | None:
         return Daqp(self.reduction.Ct) if self.reduction.Ct.ndim == 2 else None
 
-    def solve(self, theta: Tensor, lower: Tensor, upper: Tensor, batch: torch.Size) -> Solved:
-        """Solve for every theta `(B, n_theta)`.
+    def solve(self, theta: Tensor, lower: Tensor, upper: Tensor) -> Solved:
+        """Solve for every theta.
 
         Args:
-            theta: (u_ini, y_ini, u_ref, y_ref), float64.
-            lower, upper: bounds `(N,)` or `(B, N)`.
-            batch: the caller's batch shape, to name samples in errors.
+            theta: (u_ini, y_ini, u_ref, y_ref), `(*batch, n_theta)`, float64.
+            lower, upper: bounds `(N,)` or `(*batch, N)`.
 
         Raises:
             ValueError: values that are not finite.
             InfeasibleError, SolveError: with `on_failure="raise"`, if a sample has no accepted solution.
         """
-        daqp_first = self._is_daqp_first(theta)
-        if daqp_first and len(theta) <= FEW and theta.device.type == "cpu" and lower.ndim == 1 and self._daqp:
-            quick = self._one_by_one(theta.numpy(), lower.numpy(), upper.numpy())
+        batch = theta.shape[:-1]
+        samples = theta.reshape(-1, theta.shape[-1])
+        daqp_first = self._is_daqp_first(samples)
+        if daqp_first and len(samples) <= FEW and theta.device.type == "cpu" and lower.ndim == 1 and upper.ndim == 1:
+            quick = self._one_by_one(samples.numpy(), lower.numpy(), upper.numpy(), batch)
             if quick is not None:
                 return quick
-        self._check_finite(theta)
+        self._check_finite(samples)
+        solved = self._solve(samples, per_sample(lower, 1, batch), per_sample(upper, 1, batch), daqp_first)
+        self._report(solved, batch)
+        return Solved(*(x.reshape(*batch, x.shape[-1]) for x in solved))
+
+    def _solve(self, theta: Tensor, lower: Tensor, upper: Tensor, daqp_first: bool) -> Solved:
+        """Run the first engine on the batch, the second on what it left."""
         solved = self._attempt(self._engine(daqp_first), theta, lower, upper)
         failed = solved.failed
         if bool(failed.any()):
@@ -110,7 +117,6 @@ class Solver:
             for whole, part in zip(solved, retried, strict=True):
                 whole[rest] = part
             subset._mark_failures(solved, rest, *problem)
-            self._report(solved, batch)
         return solved
 
     def _check_finite(self, theta: Tensor) -> None:
@@ -136,9 +142,12 @@ class Solver:
         info = [failed * Status.FAILED, found.iterations, judged.residual, judged.n_active, judged.n_weakly_active]
         return Solved(judged.v, found.lam, judged.active, torch.stack([i.double() for i in info], dim=-1))
 
-    def _one_by_one(self, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> Solved | None:
+    def _one_by_one(
+        self, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray, batch: tuple[int, ...]
+    ) -> Solved | None:
         """Run DAQP and judge its own multipliers, in NumPy; None if one sample does not convince."""
-        assert self._daqp is not None
+        if self._daqp is None:
+            return None
         tight = lower == upper
         v, lam = np.empty((len(theta), len(lower))), np.empty((len(theta), len(lower)))
         active, info = np.empty(v.shape, dtype=bool), np.empty((len(theta), 5))
@@ -149,7 +158,7 @@ class Solver:
             if not (flag == SOLVED_FLAG and residual <= AS_GOOD_AS_POLISHED):  # NaN is not either
                 return None
             info[i] = Status.SOLVED, iterations, residual, n_active, n_weak
-        return Solved(*(torch.from_numpy(x) for x in (v, lam, active, info)))
+        return Solved(*(torch.from_numpy(x.reshape(*batch, -1)) for x in (v, lam, active, info)))
 
     def _mark_failures(self, solved: Solved, rest: Tensor, theta: Tensor, lower: Tensor, upper: Tensor) -> None:
         """Look for certificates where both engines failed; leave NaN for v and nothing in the multipliers."""
