@@ -100,13 +100,16 @@ class DPCLayer(nn.Module):
         """Unknowns of the paper's system: 2 horizon (n_u + n_y) + t_ini n_u + n_g."""
         return 2 * self.reduced_kkt_size + self.data.t_ini * self.data.n_u + self.data.n_g
 
-    def forward(self, u_ini: Any, y_ini: Any, *, y_ref: Any = None, u_ref: Any = None) -> DPCSolution:
+    def forward(
+        self, u_ini: Any, y_ini: Any, *, y_ref: Any = None, u_ref: Any = None, on_failure: str | None = None
+    ) -> DPCSolution:
         """Plan from the last `t_ini` inputs and outputs.
 
         Args:
             u_ini: past inputs, `(*batch, t_ini, n_u)`.
             y_ini: past outputs, `(*batch, t_ini, n_y)`.
             y_ref, u_ref: references, broadcast to `(*batch, horizon, n)`; zero by default.
+            on_failure: in place of the layer's own, for this call.
 
         Returns:
             The plan, in the dtype and on the device of the measurements.
@@ -118,6 +121,9 @@ class DPCLayer(nn.Module):
         """
         theta, dtype = self._theta(u_ini, y_ini, y_ref, u_ref)
         reduction, solver = self._factors(theta.device)
+        if on_failure is not None and on_failure != solver.on_failure:
+            _check_choice("on_failure", on_failure, ("raise", "nan"))
+            solver = solver.with_failures(on_failure)
         lower, upper = self._bounds(theta.device)
         v, lam, _, info = SolveReduced.apply(theta, reduction.V, reduction.G, reduction.Ct, lower, upper, solver)
         u, y = v.split((self.sizes.u, self.sizes.y), dim=-1)

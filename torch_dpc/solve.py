@@ -82,6 +82,12 @@ class Solver:
     def _daqp(self) -> Daqp | None:
         return Daqp(self.reduction.Ct) if self.reduction.Ct.ndim == 2 else None
 
+    def with_failures(self, on_failure: str) -> Solver:
+        """Return the same solver, its prepared parts included, with another `on_failure`."""
+        other = replace(self, on_failure=on_failure)
+        other.__dict__.update({k: v for k, v in self.__dict__.items() if k not in ("on_failure",)})
+        return other
+
     def solve(self, theta: Tensor, lower: Tensor, upper: Tensor) -> Solved:
         """Solve for every theta.
 

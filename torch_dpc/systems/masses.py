@@ -60,7 +60,7 @@ class OscillatingMasses:
         if x.shape != (self.n_y,):
             raise ValueError(f"`state` must have shape ({self.n_y},), got {tuple(x.shape)}.")
         self._x = x
-        return self._measure()
+        return self.measure()
 
     def step(self, u: Any) -> Tensor:
         """Apply the forces u, `(n_u,)` [N], for one step and return the measurement after it, `(n_y,)`."""
@@ -68,9 +68,10 @@ class OscillatingMasses:
         if u.shape != (self.n_u,):
             raise ValueError(f"`u` must have shape ({self.n_u},), got {tuple(u.shape)}.")
         self._x = self.A @ self._x + self.B @ u
-        return self._measure()
+        return self.measure()
 
-    def _measure(self) -> Tensor:
+    def measure(self) -> Tensor:
+        """Return the present outputs, `(n_y,)`, with new noise if there is any."""
         if self.noise == 0:
             return self._x
         return self._x + self.noise * torch.randn(self.n_y, dtype=torch.float64, generator=self.generator)

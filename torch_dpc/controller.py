@@ -1,0 +1,88 @@
+"""Receding-horizon control with the layer."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .errors import Status
+from .layer import DPCLayer
+
+
+class DPCController:
+    """Plan every few steps and apply the plan open loop in between.
+
+    At step k it knows the inputs and outputs of the steps k - t_ini ... k - 1. A plan already lies in the input set, so
+    it is applied as it is.
+
+    Args:
+        layer: the planning problem.
+        replan_every: steps of a plan that are applied before the next one; at most the horizon.
+        on_failure: what to do when the problem has no solution: "raise", or "hold" to go on with the rest of the
+            previous plan, its last input held beyond its end (before any plan: the input nearest to zero in the set).
+
+    Example:
+        >>> from torch_dpc import Box, DPCController, DPCLayer, HankelData, collect, simulate, systems
+        >>> plant, generator = systems.OscillatingMasses(), torch.Generator().manual_seed(0)
+        >>> data = HankelData.from_trajectories(*collect(plant, 120, generator=generator), t_ini=4, horizon=10)
+        >>> layer = DPCLayer(data, Q=10.0, R=1.0, lambda_g=1.0, lambda_s=1e4, u_set=Box(-1.0, 1.0))
+        >>> log = simulate(plant, DPCController(layer, replan_every=5), torch.zeros(4), steps=20)
+        >>> log.u.shape
+        torch.Size([20, 2])
+    """
+
+    def __init__(self, layer: DPCLayer, replan_every: int = 10, *, on_failure: str = "raise"):
+        horizon = layer.data.horizon
+        if not isinstance(replan_every, int) or not 1 <= replan_every <= horizon:
+            raise ValueError(
+                f"`replan_every` must be an integer from 1 to the horizon, {horizon}, got {replan_every!r}."
+            )
+        if on_failure not in ("raise", "hold"):
+            raise ValueError(f'`on_failure` must be "raise" or "hold", got {on_failure!r}.')
+        self.layer = layer
+        self.replan_every = replan_every
+        self.on_failure = on_failure
+        self.reset()
+
+    def reset(self) -> None:
+        """Forget the previous plan."""
+        self._plan: Tensor | None = None
+        self._age = 0  # steps since the plan in force was made
+        self._due = 0  # steps until the next one
+        self.status = Status.SOLVED
+
+    @property
+    def replans_now(self) -> bool:
+        """Whether the next `step` plans anew."""
+        return self._due == 0
+
+    def step(self, u_ini: Any, y_ini: Any, *, y_ref: Any = None, u_ref: Any = None) -> Tensor:
+        """Return the input of this step, `(n_u,)`, planning first where one is due.
+
+        Args:
+            u_ini, y_ini: the last `t_ini` inputs and outputs, `(t_ini, n)`.
+            y_ref, u_ref: references over the horizon, as the layer takes them.
+
+        Raises:
+            SolveError: the problem has no solution, with `on_failure="raise"`.
+        """
+        if self.replans_now:
+            self._replan(u_ini, y_ini, y_ref, u_ref)
+            self._due = self.replan_every
+        assert self._plan is not None
+        u = self._plan[min(self._age, len(self._plan) - 1)]
+        self._age += 1
+        self._due -= 1
+        return u
+
+    def _replan(self, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any) -> None:
+        on_failure = "raise" if self.on_failure == "raise" else "nan"
+        solution = self.layer(u_ini, y_ini, y_ref=y_ref, u_ref=u_ref, on_failure=on_failure)
+        self.status = Status(int(solution.info.status))
+        if self.status == Status.SOLVED:
+            self._plan, self._age = solution.u, 0
+        elif self._plan is None:
+            zero = torch.zeros(self.layer.data.n_u, dtype=solution.u.dtype, device=solution.u.device)
+            self._plan, self._age = self.layer.u_set.project(zero).reshape(-1, self.layer.data.n_u), 0
