@@ -23,7 +23,8 @@ from torch import Tensor
 
 from .active_set import adjoint, solve_active
 from .errors import Status
-from .linear import outer, per_sample, times
+from .linear import flatten_batch, lead_all, outer, times
+from .projected_kkt import FullAdjoint
 from .solve import Solver
 
 
@@ -42,6 +43,7 @@ class SolveReduced(torch.autograd.Function):
         _, lam, active, info = output
         ctx.mark_non_differentiable(active, info)
         ctx.set_materialize_grads(False)
+        ctx.full = solver.full
         ctx.may_fail = solver.on_failure != "raise"
         saved = (theta, V, G, Ct, lower, upper, lam, active, info)
         ctx.save_for_backward(*saved)
@@ -58,6 +60,8 @@ class SolveReduced(torch.autograd.Function):
             solved = info[..., :1] == Status.SOLVED
             v_bar = torch.where(solved, v_bar, 0.0)
             lam_bar = None if lam_bar is None else torch.where(solved, lam_bar, 0.0)
+        if ctx.full is not None:
+            return FullAdjoint.apply(v_bar, lam_bar, active, ctx.full), *(None,) * 6
         v0_bar = SolveAdjoint.apply(v_bar, lam_bar, active, G, Ct)
         need = ctx.needs_input_grad
         theta_bar = times(V.mT, v0_bar) if need[0] else None
@@ -106,7 +110,7 @@ class SolveReduced(torch.autograd.Function):
                 "vmap over weights or data is not supported: give the layer weights with a leading batch dimension, "
                 "which share one batched factorisation."
             )
-        theta, lower, upper = _lead_all(
+        theta, lower, upper = lead_all(
             (theta, lower, upper), (in_dims[0], in_dims[4], in_dims[5]), (1, 1, 1), info.batch_size
         )
         outputs = SolveReduced.apply(theta, V, G, Ct, lower, upper, solver)
@@ -118,10 +122,8 @@ class SolveAdjoint(torch.autograd.Function):
 
     @staticmethod
     def forward(v_bar: Tensor, lam_bar: Tensor | None, active: Tensor, G: Tensor, Ct: Tensor) -> Tensor:
-        n, batch = v_bar.shape[-1], v_bar.shape[:-1]
-        bars = [None if bar is None else bar.reshape(-1, n) for bar in (v_bar, lam_bar)]
-        rows = active.expand(v_bar.shape).reshape(-1, n)
-        return adjoint(per_sample(G, 2, batch), per_sample(Ct, 2, batch), rows, *bars).reshape(v_bar.shape)
+        batch, (G, Ct), (rows, v_bar, *rest) = flatten_batch((G, Ct), (active, v_bar, lam_bar))
+        return adjoint(G, Ct, rows, v_bar, rest[0]).reshape(*batch, -1)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -135,7 +137,8 @@ class SolveAdjoint(torch.autograd.Function):
         need = ctx.needs_input_grad
         s = SolveActive.apply(bar, active, G, Ct)
         v_bar_bar = bar - times(G, s) if need[0] else None
-        return v_bar_bar, s if need[1] else None, None, outer(-s, v0_bar, G) if need[3] else None, None
+        G_bar = outer(-s, v0_bar, G) if need[3] else None
+        return v_bar_bar, s if need[1] else None, None, G_bar, None
 
     @staticmethod
     def jvp(ctx: Any, v_t: Tensor | None, lam_t: Tensor | None, _active: Any, G_t: Tensor | None, _Ct: Any) -> Tensor:
@@ -148,7 +151,7 @@ class SolveAdjoint(torch.autograd.Function):
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Tensor, int]:
         v_bar, lam_bar, *shared = args
-        lifted = _lead_all((v_bar, lam_bar, *shared), in_dims, (1, 1, 1, 2, 2), info.batch_size)
+        lifted = lead_all((v_bar, lam_bar, *shared), in_dims, (1, 1, 1, 2, 2), info.batch_size)
         return SolveAdjoint.apply(*lifted), 0
 
 
@@ -157,10 +160,8 @@ class SolveActive(torch.autograd.Function):
 
     @staticmethod
     def forward(rhs: Tensor, active: Tensor, G: Tensor, Ct: Tensor) -> Tensor:
-        n, batch = rhs.shape[-1], rhs.shape[:-1]
-        rows = active.expand(rhs.shape).reshape(-1, n)
-        s, _ = solve_active(per_sample(G, 2, batch), per_sample(Ct, 2, batch), rows, rhs.reshape(-1, n))
-        return s.reshape(rhs.shape)
+        batch, (G, Ct), (rows, rhs) = flatten_batch((G, Ct), (active, rhs))
+        return solve_active(G, Ct, rows, rhs)[0].reshape(*batch, -1)
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:
@@ -185,33 +186,9 @@ class SolveActive(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], *args: Tensor) -> tuple[Tensor, int]:
-        return SolveActive.apply(*_lead_all(args, in_dims, (1, 1, 2, 2), info.batch_size)), 0
+        return SolveActive.apply(*lead_all(args, in_dims, (1, 1, 2, 2), info.batch_size)), 0
 
 
 # `apply` binds its arguments by the signature of `forward` at every call; finding it anew each time costs 15 us.
 for _function in (SolveReduced, SolveAdjoint, SolveActive):
     setattr(_function.forward, "__signature__", inspect.signature(_function.forward))  # noqa: B010
-
-
-def _lead_all(
-    tensors: tuple[Tensor | None, ...], dims: tuple[int | None, ...], tails: tuple[int, ...], size: int
-) -> list[Tensor | None]:
-    """Bring the mapped dimension of each tensor to the front, so that all broadcast as one batch.
-
-    Args:
-        tensors: the first carries the batch, and is expanded where it is not mapped itself.
-        dims: the mapped dimension of each, or None.
-        tails: how many dimensions at the end are a tensor's own.
-        size: of the mapped dimension.
-    """
-    pairs = list(zip(tensors, dims, tails, strict=True))
-    depth = max(x.ndim - (dim is not None) - tail for x, dim, tail in pairs if x is not None)
-    out: list[Tensor | None] = []
-    for place, (x, dim, tail) in enumerate(pairs):
-        if x is not None and dim is not None:
-            x = x.movedim(dim, 0)
-            x = x.reshape(x.shape[0], *(1,) * (depth + 1 + tail - x.ndim), *x.shape[1:])
-        elif x is not None and place == 0:
-            x = x.expand(size, *(1,) * (depth + tail - x.ndim), *x.shape)
-        out.append(x)
-    return out

@@ -14,6 +14,7 @@ from .function import SolveReduced
 from .hankel import HankelData
 from .linear import times
 from .problem import CompactForm, Sizes, compact_form, penalty, stacked_bounds, weight_matrix
+from .projected_kkt import FullSystem
 from .reduction import DataRows, Reduction, Weights, reduce
 from .sets import Box, ConvexSet, Reals
 from .solution import DPCSolution, SolveInfo
@@ -202,7 +203,16 @@ class DPCLayer(nn.Module):
 
     def _factor(self, device: torch.device) -> tuple[Reduction, Solver]:
         reduction = reduce(DataRows.of(self.data, device), self._weights(device))
-        return reduction, Solver(reduction.detach(), self.sizes, self.solver, self.on_failure)
+        detached = reduction.detach()
+        full = None
+        if self.backward_system == "full":
+            if reduction.V.requires_grad or reduction.V.ndim > 2:
+                raise ValueError(
+                    'backward="full" differentiates with respect to measurements and references of one problem; '
+                    'use backward="reduced" for weights or data that learn, or have a batch dimension.'
+                )
+            full = FullSystem(self.data, detached.weights)
+        return reduction, Solver(detached, self.sizes, self.solver, self.on_failure, full)
 
     def _cached(self, name: str, device: torch.device, sources: tuple[Any, ...], make: Any, *args: Any) -> Any:
         """Return what `make` makes of the sources, made anew when their *values* have changed.

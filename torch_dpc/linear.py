@@ -1,5 +1,8 @@
-"""Products of one matrix, or one matrix a sample, with a batch of vectors."""
+"""Shapes: one matrix or one matrix a sample, with a batch of vectors."""
 
+from typing import Any
+
+import torch
 from torch import Tensor
 
 
@@ -17,6 +20,41 @@ def outer(y: Tensor, x: Tensor, like: Tensor) -> Tensor:
     return (y[..., :, None] * x[..., None, :]).sum_to_size(like.shape)
 
 
-def per_sample(x: Tensor, tail: int, batch: tuple[int, ...]) -> Tensor:
-    """Return a tensor with `tail` dimensions of its own for a flattened batch: shared as it is, or `(B, ...)`."""
-    return x if x.ndim == tail else x.expand(*batch, *x.shape[-tail:]).reshape(-1, *x.shape[-tail:])
+def flatten_batch(
+    matrices: tuple[Tensor, ...], vectors: tuple[Tensor | None, ...]
+) -> tuple[torch.Size, list[Tensor], list[Any]]:
+    """Broadcast the batch dimensions of all and flatten them to one.
+
+    Returns:
+        The batch shape; the matrices, `(m, n)` where they were shared and `(B, m, n)` otherwise; the vectors, `(B, n)`,
+        None where they were None.
+    """
+    shapes = [x.shape[:-2] for x in matrices] + [x.shape[:-1] for x in vectors if x is not None]
+    batch = torch.broadcast_shapes(*shapes)
+    flat_matrices = [m if m.ndim == 2 else m.expand(*batch, -1, -1).reshape(-1, *m.shape[-2:]) for m in matrices]
+    flat_vectors = [x if x is None else x.expand(*batch, -1).reshape(-1, x.shape[-1]) for x in vectors]
+    return batch, flat_matrices, flat_vectors
+
+
+def lead_all(
+    tensors: tuple[Tensor | None, ...], dims: tuple[int | None, ...], tails: tuple[int, ...], size: int
+) -> list[Tensor | None]:
+    """Bring the dimension that `vmap` maps of each tensor to the front, so that all broadcast as one batch.
+
+    Args:
+        tensors: the first carries the batch, and is expanded where it is not mapped itself.
+        dims: the mapped dimension of each, or None.
+        tails: how many dimensions at the end are a tensor's own.
+        size: of the mapped dimension.
+    """
+    pairs = list(zip(tensors, dims, tails, strict=True))
+    depth = max(x.ndim - (dim is not None) - tail for x, dim, tail in pairs if x is not None)
+    out: list[Tensor | None] = []
+    for place, (x, dim, tail) in enumerate(pairs):
+        if x is not None and dim is not None:
+            x = x.movedim(dim, 0)
+            x = x.reshape(x.shape[0], *(1,) * (depth + 1 + tail - x.ndim), *x.shape[1:])
+        elif x is not None and place == 0:
+            x = x.expand(size, *(1,) * (depth + tail - x.ndim), *x.shape)
+        out.append(x)
+    return out

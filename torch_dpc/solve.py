@@ -15,10 +15,11 @@ from .checks import as_data, is_finite
 from .dual_active_set import SOLVED_FLAG, Daqp, solve_daqp
 from .errors import InfeasibleError, SolveError, Status
 from .infeasibility import infeasibility_certificate
-from .linear import per_sample, times
+from .linear import flatten_batch, times
 from .newton import ActiveSetResult, solve_newton
 from .optimality import BATCHED, SINGLE, Optimality
 from .problem import Sizes
+from .projected_kkt import FullSystem
 from .reduction import Reduction
 
 #: A sample is accepted when F, relative to its own terms, is at most this.
@@ -63,12 +64,14 @@ class Solver:
         sizes: the parts of theta.
         engine: "auto", "newton" or "daqp".
         on_failure: "raise" or "nan".
+        full: the paper's full system, where the backward is to solve that one.
     """
 
     reduction: Reduction
     sizes: Sizes
     engine: str
     on_failure: str
+    full: FullSystem | None = None
 
     @cached_property
     def _batched(self) -> Optimality:
@@ -99,15 +102,18 @@ class Solver:
             ValueError: values that are not finite.
             InfeasibleError, SolveError: with `on_failure="raise"`, if a sample has no accepted solution.
         """
-        batch = theta.shape[:-1]
-        samples = theta.reshape(-1, theta.shape[-1])
-        daqp_first = self._is_daqp_first(samples)
-        if daqp_first and len(samples) <= FEW and theta.device.type == "cpu" and lower.ndim == 1 and upper.ndim == 1:
-            quick = self._one_by_one(samples.numpy(), lower.numpy(), upper.numpy(), batch)
-            if quick is not None:
-                return quick
+        daqp_first = self._is_daqp_first(theta)
+        if daqp_first and theta.ndim <= 2 and theta.device.type == "cpu" and lower.ndim == upper.ndim == 1:
+            samples = theta.numpy().reshape(-1, theta.shape[-1])
+            if len(samples) <= FEW:
+                quick = self._one_by_one(samples, lower.numpy(), upper.numpy(), theta.shape[:-1])
+                if quick is not None:
+                    return quick
+        shared_bounds = lower.ndim == upper.ndim == 1
+        vectors = (theta,) if shared_bounds else (theta, lower, upper)
+        batch, _, (samples, *bounds) = flatten_batch((self.reduction.G,), vectors)
         self._check_finite(samples)
-        solved = self._solve(samples, per_sample(lower, 1, batch), per_sample(upper, 1, batch), daqp_first)
+        solved = self._solve(samples, *(bounds or (lower, upper)), daqp_first=daqp_first)
         self._report(solved, batch)
         return Solved(*(x.reshape(*batch, x.shape[-1]) for x in solved))
 
@@ -133,7 +139,8 @@ class Solver:
 
     def _is_daqp_first(self, theta: Tensor) -> bool:
         """DAQP is faster for a few problems with one matrix, Newton for many; `scripts/benchmark.py` shows where."""
-        suits = theta.device.type == "cpu" and len(theta) <= DAQP_BATCH and self._daqp is not None
+        count = theta.numel() // theta.shape[-1]
+        suits = theta.device.type == "cpu" and count <= DAQP_BATCH and self._daqp is not None
         return self.engine == "daqp" or (self.engine == "auto" and suits)
 
     def _engine(self, daqp: bool) -> Engine:
