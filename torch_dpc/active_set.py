@@ -20,7 +20,7 @@ PIVOT_RATIO = 1e-5
 #: Rows of Ct that stand out of the span of the others by less than this fraction of their length are dependent.
 DEPENDENT_ROW = 1e-9
 #: Samples of like size that share one padded factorisation on the CPU.
-GROUP = 128
+GROUP = 256
 #: Up to this many samples NumPy, one after the other, beats the packing.
 FEW = 4
 

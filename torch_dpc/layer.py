@@ -87,9 +87,14 @@ class DPCLayer(nn.Module):
         self.solver = solver
         self.on_failure = on_failure
         self.sizes = Sizes.of(data)
-        self._cache: dict[tuple[str, torch.device], Any] = {}
+        self._cache: dict[tuple[str, torch.device], tuple[tuple[Any, ...], Any]] = {}
         self._weights(torch.device("cpu"))  # bad weights and bounds are told now, not at the first call
         stacked_bounds(self.u_set, self.y_set, data, torch.device("cpu"))
+
+    @property
+    def reduction(self) -> Reduction:
+        """The reduced problem of the present weights: V, G, Ct and what gives g back; see :mod:`torch_dpc.reduction`."""
+        return self._factors(self.data.Up.device)[0]
 
     @property
     def reduced_kkt_size(self) -> int:
@@ -122,10 +127,10 @@ class DPCLayer(nn.Module):
         """
         theta, dtype = self._theta(u_ini, y_ini, y_ref, u_ref)
         reduction, solver = self._factors(theta.device)
+        lower, upper = self._bounds(theta.device)
         if on_failure is not None and on_failure != solver.on_failure:
             _check_choice("on_failure", on_failure, ("raise", "nan"))
             solver = solver.with_failures(on_failure)
-        lower, upper = self._bounds(theta.device)
         v, lam, _, info = SolveReduced.apply(theta, reduction.V, reduction.G, reduction.Ct, lower, upper, solver)
         u, y = v.split((self.sizes.u, self.sizes.y), dim=-1)
         u, y = u.unflatten(-1, (self.data.horizon, -1)), y.unflatten(-1, (self.data.horizon, -1))
@@ -188,18 +193,28 @@ class DPCLayer(nn.Module):
             lambda_s=penalty("lambda_s", self.lambda_s).to(device),
         )
 
+    def _factors(self, device: torch.device) -> tuple[Reduction, Solver]:
+        """Return the reduced problem and its solver; with a graph, which must not outlive the call, made each time."""
+        weights = (self.Q, self.R, self.lambda_g, self.lambda_s)
+        if _carries_derivative((*weights, *self.data.matrices)):
+            return self._factor(device)
+        # The matrices of the data are constants of a frozen object: the object stands for them.
+        return self._cached(("factors", device), (*weights, self.data), self._factor, device)
+
     def _bounds(self, device: torch.device) -> tuple[Tensor, Tensor]:
         sources = (self.u_set.lower, self.u_set.upper, self.y_set.lower, self.y_set.upper)
         if _carries_derivative(sources):
             return stacked_bounds(self.u_set, self.y_set, self.data, device)
-        return self._cached("bounds", device, sources, stacked_bounds, self.u_set, self.y_set, self.data, device)
+        return self._cached(("bounds", device), sources, stacked_bounds, self.u_set, self.y_set, self.data, device)
 
-    def _factors(self, device: torch.device) -> tuple[Reduction, Solver]:
-        sources = (self.Q, self.R, self.lambda_g, self.lambda_s, *self.data.matrices)
-        if _carries_derivative(sources):
-            return self._factor(device)
-        # The matrices of the data are constants of a frozen object: the object stands for them.
-        return self._cached("factors", device, (*sources[:4], self.data), self._factor, device)
+    def _cached(self, key: tuple[str, torch.device], sources: tuple[Any, ...], make: Any, *args: Any) -> Any:
+        """Return what `make` makes of the sources, made anew when their values have changed."""
+        entry = self._cache.get(key)
+        if entry is None or not all(map(_is_same, entry[0], sources)):
+            with torch.no_grad():
+                kept = tuple(s.detach().clone() if isinstance(s, Tensor) else s for s in sources)
+                entry = self._cache[key] = (kept, make(*args))
+        return entry[1]
 
     def _factor(self, device: torch.device) -> tuple[Reduction, Solver]:
         reduction = reduce(DataRows.of(self.data, device), self._weights(device))
@@ -213,18 +228,6 @@ class DPCLayer(nn.Module):
                 )
             full = FullSystem(self.data, detached.weights)
         return reduction, Solver(detached, self.sizes, self.solver, self.on_failure, full)
-
-    def _cached(self, name: str, device: torch.device, sources: tuple[Any, ...], make: Any, *args: Any) -> Any:
-        """Return what `make` makes of the sources, made anew when their *values* have changed.
-
-        Version counters would be cheaper, but they miss edits through `.data` and optimisers that use it.
-        """
-        entry = self._cache.get((name, device))
-        if entry is None or not all(map(_is_same, entry[0], sources)):
-            with torch.no_grad():
-                kept = tuple(s.detach().clone() if isinstance(s, Tensor) else s for s in sources)
-                entry = self._cache[name, device] = (kept, make(*args))
-        return entry[1]
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the factors out of copies and pickles: they are made again when needed."""
@@ -279,6 +282,7 @@ def _carries_derivative(sources: tuple[Any, ...]) -> bool:
 
 
 def _is_same(kept: Any, now: Any) -> bool:
+    """Compare values: version counters would be cheaper, but miss edits through `.data`."""
     if isinstance(kept, Tensor) and isinstance(now, Tensor):
         return kept.shape == now.shape and kept.dtype == now.dtype and torch.equal(kept.to(now.device), now)
     return kept is now or (isinstance(kept, (int, float)) and isinstance(now, (int, float)) and kept == now)

@@ -5,7 +5,9 @@ on them, rows whose multiplier has the wrong sign are let go, and
 
     lam_A = G[A, A]^-1 (v0 - bound)_A,    lam = 0 elsewhere
 
-(the primal-dual active set method; Hintermueller, Ito, Kunisch 2002). It ends, exactly, when the set repeats.
+(the primal-dual active set method; Hintermueller, Ito, Kunisch 2002). It ends, exactly, when the set repeats. The first
+set comes from a few accelerated gradient steps on the multipliers in single precision, which are matrix products alone
+and cost less than one Newton step; it is nearly right, so one or two steps finish.
 """
 
 from __future__ import annotations
@@ -19,6 +21,10 @@ from .active_set import solve_active
 
 #: Steps after which a sample is left to the second engine; converging samples need 2 to 7.
 MAX_STEPS = 20
+#: Rows within this fraction of the width of their bounds are worked on from the start.
+NEAR = 0.2
+#: Accelerated gradient steps before the first Newton step. On the masses, 15 leave 1.2 Newton steps a sample of 3.3.
+GRADIENT_STEPS = 15
 #: By how much v + lam must pass a bound (relative to 1 + |bound|) for its row to be active. Without it rounding makes
 #: the set flicker at rows that only touch their bound.
 HYSTERESIS = 1e-12
@@ -48,8 +54,9 @@ def solve_newton(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor
     )
     todo = torch.arange(len(v0), device=v0.device)
     tight = (lower == upper).expand_as(v0).any(dim=0)
-    working = tight | _outside(v0, lower, upper).any(dim=0)
-    # Most rows never meet a bound: iterate on the rows that some sample violates, then look at all rows once.
+    # Most rows never meet a bound: iterate on those that some sample violates or comes near, then look at all rows.
+    near = torch.nan_to_num(NEAR * (upper - lower), posinf=0.0)
+    working = tight | _outside(v0, lower + near, upper - near).any(dim=0)
     while len(todo):
         rows = working.nonzero()[:, 0]
         G_rows = _take(G, todo)[..., rows, :]
@@ -81,8 +88,9 @@ def _iterate(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) ->
         return lam_out, steps, ~converged
     tight = lower == upper
     todo = torch.arange(len(v0), device=v0.device)
-    lam, v = lam_out, v0
-    target = torch.minimum(torch.maximum(v, lower), upper)
+    lam = _foresee(G, v0, lower, upper)
+    v = v0 - _times(lam, G)
+    target = torch.minimum(torch.maximum(v + lam, lower), upper)
     for step in range(1, MAX_STEPS + 1):
         active = _is_active(v + lam - target, target, _take_bound(tight, todo))
         lam, independent = solve_active(_take(G, todo), _take(Ct, todo), active, v0[todo] - target)
@@ -101,6 +109,20 @@ def _iterate(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) ->
             break
     steps[todo] = MAX_STEPS
     return lam_out, steps, converged
+
+
+def _foresee(G: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+    """Return rough multipliers: Nesterov's method on their problem, step 1/|G|."""
+    G, v0, lower, upper = (x.float() for x in (G, v0, lower, upper))
+    size = G.abs().sum(-1).amax(-1)  # a norm that bounds the largest eigenvalue
+    size = torch.where(size > 0, size, 1.0)[..., None]
+    lam = ahead = torch.zeros_like(v0)
+    for k in range(GRADIENT_STEPS):
+        pushed = v0 - _times(ahead, G) + size * ahead
+        new = (pushed - torch.minimum(torch.maximum(pushed, lower), upper)) / size
+        ahead = torch.lerp(lam, new, 1 + k / (k + 3))
+        lam = new
+    return lam.double()
 
 
 def _is_active(excess: Tensor, target: Tensor, tight: Tensor) -> Tensor:

@@ -102,13 +102,14 @@ def as_weight(name: str, value: Any) -> Tensor:
 
 def stacked_bounds(u_set: Box, y_set: Box, data: HankelData, device: torch.device) -> tuple[Tensor, Tensor]:
     """Return the bounds of v = (u, y), each `(horizon (n_u + n_y),)` in float64; a graph is kept."""
-    lower, upper = [], []
+    lower: list[Tensor] = []
+    upper: list[Tensor] = []
     for name, box, channels in (("u_set", u_set, data.n_u), ("y_set", y_set, data.n_y)):
         box.check()
-        for bounds, value in ((lower, box.lower), (upper, box.upper)):
-            shape = (data.horizon, channels)
+        shape = (data.horizon, channels)
+        for bounds, value in zip((lower, upper), box.bounds(torch.empty(0, dtype=torch.float64, device=device)), strict=True):
             try:
-                whole = torch.broadcast_to(value.to(device=device, dtype=torch.float64), shape)
+                whole = torch.broadcast_to(value, shape)
             except RuntimeError as error:
                 raise ValueError(
                     f"the bounds of `{name}` must be numbers or have shape ({channels},) or {shape}, "

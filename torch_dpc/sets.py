@@ -50,27 +50,34 @@ class Box(ConvexSet):
         self.upper = _as_bound("upper", upper)
         self.check()
 
+    def bounds(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Return lower and upper as tensors of the dtype and on the device of another; graphs are kept."""
+        lower, upper = (torch.as_tensor(bound).to(like) for bound in (self.lower, self.upper))
+        return lower, upper
+
     def check(self) -> None:
         """Raise ValueError unless lower <= upper and a finite point lies between."""
-        lower, upper = self.lower.detach(), self.upper.detach()
-        if not bool((lower <= upper.to(lower.device)).all()):
+        lower, upper = (torch.as_tensor(bound).detach().double().cpu() for bound in (self.lower, self.upper))
+        if not bool((lower <= upper).all()):
             raise ValueError("`lower` must be at most `upper` in every component, got crossed or NaN bounds.")
         if bool((lower == math.inf).any()) or bool((upper == -math.inf).any()):
             raise ValueError("`lower` must be below +infinity and `upper` above -infinity.")
 
     def project(self, x: Tensor) -> Tensor:
-        return torch.maximum(torch.minimum(x, self.upper.to(x)), self.lower.to(x))
+        lower, upper = self.bounds(x)
+        return torch.maximum(torch.minimum(x, upper), lower)
 
     def jacobian_product(self, x: Tensor, v: Tensor) -> Tensor:
-        inside = (x >= self.lower.to(x)) & (x <= self.upper.to(x))
-        return torch.where(inside, v, 0.0)
+        lower, upper = self.bounds(x)
+        return torch.where((x >= lower) & (x <= upper), v, 0.0)
 
     def minimize_linear(self, c: Tensor) -> Tensor:
-        lower, upper = self.lower.to(c), self.upper.to(c)
-        inner = torch.minimum(torch.maximum(torch.zeros_like(c), lower), upper)  # where c = 0 any point will do
-        return torch.where(c > 0, lower.expand_as(c), torch.where(c < 0, upper.expand_as(c), inner))
+        lower, upper = self.bounds(c)
+        anywhere = torch.minimum(torch.maximum(torch.zeros_like(c), lower), upper)  # where c = 0 any point will do
+        return torch.where(c > 0, lower.expand_as(c), torch.where(c < 0, upper.expand_as(c), anywhere))
 
     def extra_repr(self) -> str:
+        """Show the bounds."""
         return f"lower={_short(self.lower)}, upper={_short(self.upper)}"
 
 
@@ -81,19 +88,22 @@ class Reals(Box):
         super().__init__(-math.inf, math.inf)
 
     def extra_repr(self) -> str:
+        """Show nothing: there are no bounds."""
         return ""
 
 
-def _as_bound(name: str, value: Any) -> Tensor:
+def _as_bound(name: str, value: Any) -> Tensor | float:
+    """Keep a floating tensor as it is; anything else becomes a float or a float64 tensor."""
     if isinstance(value, Tensor):
         if not value.is_floating_point():
             raise ValueError(f"`{name}` must hold floating-point numbers, got {value.dtype}.")
         return value
     try:
-        return torch.as_tensor(value, dtype=torch.float64)
+        tensor = torch.as_tensor(value, dtype=torch.float64)
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"`{name}` must be a number or an array of numbers, got {value!r}.") from error
+    return tensor.item() if tensor.ndim == 0 else tensor
 
 
-def _short(bound: Tensor) -> str:
-    return f"{bound.item():g}" if bound.numel() == 1 else f"tensor{tuple(bound.shape)}"
+def _short(bound: Tensor | float) -> str:
+    return f"tensor{tuple(bound.shape)}" if isinstance(bound, Tensor) else f"{bound:g}"
