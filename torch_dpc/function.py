@@ -1,6 +1,6 @@
 """The autograd Function of the reduced problem.
 
-At a solution  v = v0 - G lam,  v0 = V theta,  with A the active rows and b their bounds,
+At a solution  v = v0 - G lam,  v0 = C A theta,  with A the active rows and b their bounds,
 
     lam_A = G_AA^-1 (v0 - b)_A,    lam = 0 elsewhere,
 
@@ -8,7 +8,7 @@ the projected Karush-Kuhn-Tucker system of the paper after the reduction. A cota
 one system with the same symmetric matrix:
 
     s_A = G_AA^-1 (lam_bar - G v_bar)_A,     v0_bar = v_bar + s,     b_bar = -s_A,   G_bar = -v0_bar lam',
-    theta_bar = V' v0_bar,                   V_bar = v0_bar theta'.
+    a_bar = C' v0_bar,   theta_bar = A' a_bar,   A_bar = a_bar theta',   C_bar = v0_bar (A theta)'.
 
 Everything in the backward is differentiable again, the system included, so derivatives of any order come out.
 """
@@ -24,74 +24,99 @@ from torch import Tensor
 from .active_set import adjoint, solve_active
 from .errors import Status
 from .linear import flatten_batch, lead_all, outer, times
+from .transforms import carries_derivative, is_plain
 from .projected_kkt import FullAdjoint
-from .solve import Solver
+from .reduction import Reduction
+from .solve import Solved, Solver
+
+
+def solve_reduced(solver: Solver, theta: Tensor, reduction: Reduction, lower: Tensor, upper: Tensor) -> Solved:
+    """Solve for every theta `(*batch, n_theta)`; differentiable in theta, the reduction and the bounds."""
+    inputs = (theta, reduction.A_theta, reduction.rows.C, reduction.G, reduction.Ct, lower, upper)
+    if not carries_derivative(inputs) and is_plain(theta):  # a third of the time of a small call is the Function's
+        return solver.solve(theta, lower, upper)
+    return Solved(*SolveReduced.apply(*inputs, solver))
 
 
 class SolveReduced(torch.autograd.Function):
-    """(theta, V, G, Ct, lower, upper) -> v, lam, active, info, as `Solved` describes them."""
+    """(theta, A, C, G, Ct, lower, upper) -> v, lam, active, info, as `Solved` describes them."""
 
     @staticmethod
     def forward(
-        theta: Tensor, V: Tensor, G: Tensor, Ct: Tensor, lower: Tensor, upper: Tensor, solver: Solver
+        theta: Tensor,
+        A: Tensor,
+        C: Tensor,
+        G: Tensor,
+        Ct: Tensor,
+        lower: Tensor,
+        upper: Tensor,
+        solver: Solver,
     ) -> tuple[Tensor, ...]:
         return tuple(solver.solve(theta, lower, upper))
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        theta, V, G, Ct, lower, upper, solver = inputs
+        theta, A, C, G, Ct, lower, upper, solver = inputs
         _, lam, active, info = output
         ctx.mark_non_differentiable(active, info)
         ctx.set_materialize_grads(False)
         ctx.full = solver.full
         ctx.may_fail = solver.on_failure != "raise"
-        saved = (theta, V, G, Ct, lower, upper, lam, active, info)
+        saved = (theta, A, C, G, Ct, lower, upper, lam, active, info)
         ctx.save_for_backward(*saved)
         ctx.save_for_forward(*saved)
 
     @staticmethod
     def backward(ctx: Any, v_bar: Tensor | None, lam_bar: Tensor | None, *_: Any) -> tuple[Tensor | None, ...]:
-        theta, V, G, Ct, lower, upper, lam, active, info = ctx.saved_tensors
+        theta, A, C, G, Ct, lower, upper, lam, active, info = ctx.saved_tensors
         if v_bar is None:
             if lam_bar is None:
-                return (None,) * 7
+                return (None,) * 8
             v_bar = torch.zeros_like(lam)
         if ctx.may_fail:  # samples without a solution add nothing, whatever came back for their NaN
             solved = info[..., :1] == Status.SOLVED
             v_bar = torch.where(solved, v_bar, 0.0)
             lam_bar = None if lam_bar is None else torch.where(solved, lam_bar, 0.0)
         if ctx.full is not None:
-            return FullAdjoint.apply(v_bar, lam_bar, active, ctx.full), *(None,) * 6
-        v0_bar = SolveAdjoint.apply(v_bar, lam_bar, active, G, Ct)
+            return FullAdjoint.apply(v_bar, lam_bar, active, ctx.full), *(None,) * 7
+        if not torch.is_grad_enabled() and is_plain(v_bar):  # nothing will be derived again: spare the Function
+            v0_bar = SolveAdjoint.forward(v_bar, lam_bar, active, G, Ct)
+        else:
+            v0_bar = SolveAdjoint.apply(v_bar, lam_bar, active, G, Ct)
         need = ctx.needs_input_grad
-        theta_bar = times(V.mT, v0_bar) if need[0] else None
-        V_bar = outer(v0_bar, theta, V) if need[1] else None
-        G_bar = outer(-v0_bar, lam, G) if need[2] else None
+        a_bar = times(C.mT, v0_bar)
+        theta_bar = times(A.mT, a_bar) if need[0] else None
+        A_bar = outer(a_bar, theta, A) if need[1] else None
+        C_bar = outer(v0_bar, times(A, theta), C) if need[2] else None
+        G_bar = outer(-v0_bar, lam, G) if need[3] else None
         lower_bar = upper_bar = None
-        if need[4] or need[5]:
+        if need[5] or need[6]:
             b_bar = torch.where(active, v_bar - v0_bar, 0.0)
             lower_bar = torch.where(lam < 0, b_bar, 0.0).sum_to_size(lower.shape)
             upper_bar = torch.where(lam < 0, 0.0, b_bar).sum_to_size(upper.shape)
-        return theta_bar, V_bar, G_bar, None, lower_bar, upper_bar, None
+        return theta_bar, A_bar, C_bar, G_bar, None, lower_bar, upper_bar, None
 
     @staticmethod
     def jvp(
         ctx: Any,
         theta_t: Tensor | None,
-        V_t: Tensor | None,
+        A_t: Tensor | None,
+        C_t: Tensor | None,
         G_t: Tensor | None,
         _Ct: Any,
         lower_t: Tensor | None,
         upper_t: Tensor | None,
         _solver: Any,
     ) -> tuple[Tensor | None, ...]:
-        theta, V, G, Ct, lower, upper, lam, active, info = ctx.saved_tensors
+        theta, A, C, G, Ct, lower, upper, lam, active, info = ctx.saved_tensors
         solved = info[..., :1] == Status.SOLVED
         free = torch.zeros_like(lam)
         if theta_t is not None:
-            free = free + times(V, theta_t)
-        if V_t is not None:
-            free = free + times(V_t, theta)
+            free = free + times(C, times(A, theta_t))
+        if A_t is not None:
+            free = free + times(C, times(A_t, theta))
+        if C_t is not None:
+            free = free + times(C_t, times(A, theta))
         if G_t is not None:
             free = free - times(G_t, lam)
         rhs = free
@@ -104,16 +129,16 @@ class SolveReduced(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        theta, V, G, Ct, lower, upper, solver = args
-        if any(dim is not None for dim in in_dims[1:4]):
+        theta, A, C, G, Ct, lower, upper, solver = args
+        if any(dim is not None for dim in in_dims[1:5]):
             raise NotImplementedError(
                 "vmap over weights or data is not supported: give the layer weights with a leading batch dimension, "
                 "which share one batched factorisation."
             )
         theta, lower, upper = lead_all(
-            (theta, lower, upper), (in_dims[0], in_dims[4], in_dims[5]), (1, 1, 1), info.batch_size
+            (theta, lower, upper), (in_dims[0], in_dims[5], in_dims[6]), (1, 1, 1), info.batch_size
         )
-        outputs = SolveReduced.apply(theta, V, G, Ct, lower, upper, solver)
+        outputs = SolveReduced.apply(theta, A, C, G, Ct, lower, upper, solver)
         return outputs, (0,) * len(outputs)
 
 

@@ -6,11 +6,10 @@ from typing import Any
 
 import torch
 from torch import Tensor, nn
-from torch.autograd import forward_ad
 
 from .checks import as_data
 from .errors import Status
-from .function import SolveReduced
+from .function import solve_reduced
 from .hankel import HankelData
 from .linear import times
 from .problem import CompactForm, Sizes, compact_form, penalty, stacked_bounds, weight_matrix
@@ -19,6 +18,7 @@ from .reduction import DataRows, Reduction, Weights, reduce
 from .sets import Box, ConvexSet, Reals
 from .solution import DPCSolution, SolveInfo
 from .solve import Solver
+from .transforms import carries_derivative
 
 
 class DPCLayer(nn.Module):
@@ -131,12 +131,12 @@ class DPCLayer(nn.Module):
         if on_failure is not None and on_failure != solver.on_failure:
             _check_choice("on_failure", on_failure, ("raise", "nan"))
             solver = solver.with_failures(on_failure)
-        v, lam, _, info = SolveReduced.apply(theta, reduction.V, reduction.G, reduction.Ct, lower, upper, solver)
+        v, lam, _, info = solve_reduced(solver, theta, reduction, lower, upper)
         u, y = v.split((self.sizes.u, self.sizes.y), dim=-1)
-        u, y = u.unflatten(-1, (self.data.horizon, -1)), y.unflatten(-1, (self.data.horizon, -1))
+        u, y = (part.reshape(*part.shape[:-1], self.data.horizon, -1) for part in (u, y))
         return DPCSolution(
-            u=u.to(dtype),
-            y=y.to(dtype),
+            u=u if dtype == torch.float64 else u.to(dtype),
+            y=y if dtype == torch.float64 else y.to(dtype),
             info=SolveInfo(info, reduction.is_selection),
             lam=lam,
             _make_g=lambda: self._g(reduction, theta, lam, info).to(dtype),
@@ -181,7 +181,8 @@ class DPCLayer(nn.Module):
                 raise ValueError(f"the batch shapes must broadcast, got {came}.") from error
             parts = [part.expand(*batch, *part.shape[-2:]) for part in parts]
         dtype = torch.promote_types(u_ini.dtype, y_ini.dtype)
-        return torch.cat([part.flatten(-2).double() for part in parts], dim=-1), dtype
+        theta = torch.cat([part.flatten(-2) for part in parts], dim=-1)
+        return (theta if theta.dtype == torch.float64 else theta.double()), dtype
 
     def _weights(self, device: torch.device) -> Weights:
         """Return the weights as float64 tensors of the whole horizon, with their graph."""
@@ -196,14 +197,14 @@ class DPCLayer(nn.Module):
     def _factors(self, device: torch.device) -> tuple[Reduction, Solver]:
         """Return the reduced problem and its solver; with a graph, which must not outlive the call, made each time."""
         weights = (self.Q, self.R, self.lambda_g, self.lambda_s)
-        if _carries_derivative((*weights, *self.data.matrices)):
+        if carries_derivative((*weights, *self.data.matrices)):
             return self._factor(device)
         # The matrices of the data are constants of a frozen object: the object stands for them.
         return self._cached(("factors", device), (*weights, self.data), self._factor, device)
 
     def _bounds(self, device: torch.device) -> tuple[Tensor, Tensor]:
         sources = (self.u_set.lower, self.u_set.upper, self.y_set.lower, self.y_set.upper)
-        if _carries_derivative(sources):
+        if carries_derivative(sources):
             return stacked_bounds(self.u_set, self.y_set, self.data, device)
         return self._cached(("bounds", device), sources, stacked_bounds, self.u_set, self.y_set, self.data, device)
 
@@ -271,14 +272,6 @@ def _reference(name: str, value: Any, steps: int, channels: int, symbol: str, li
         )
     tensor = tensor.to(like.device)
     return tensor.expand(steps, channels) if tensor.ndim == 1 else tensor.expand(*tensor.shape[:-2], steps, channels)
-
-
-def _carries_derivative(sources: tuple[Any, ...]) -> bool:
-    """Return whether a derivative, backward or forward, may be asked with respect to one of the sources."""
-    tensors = [s for s in sources if isinstance(s, Tensor)]
-    if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):
-        return True
-    return any(forward_ad.unpack_dual(t).tangent is not None for t in tensors)
 
 
 def _is_same(kept: Any, now: Any) -> bool:
