@@ -20,6 +20,10 @@ help:  ## list the targets
 reproduce: $(ENV)  ## the paper's figures and tables, into results/
 	@mkdir -p results
 	$(PY) scripts/figure3_masses.py
+	@if $(PY) -c 'import pybullet' >/dev/null 2>&1; then set -x; $(PY) scripts/figure4_quadrotor.py; \
+	else echo "NOTE: without PyBullet there is no Figure 4"; fi
+	$(PY) scripts/table1_sizes.py
+	$(PY) scripts/report.py
 
 test: $(ENV)  ## every test and docstring example (ARGS="-m 'not slow'" for the quick ones)
 	@ignore=; $(PY) -c 'import pybullet' 2>/dev/null || ignore=--ignore=torch_dpc/systems/quadrotor.py; \

@@ -148,7 +148,7 @@ class SolveAdjoint(torch.autograd.Function):
     @staticmethod
     def forward(v_bar: Tensor, lam_bar: Tensor | None, active: Tensor, G: Tensor, Ct: Tensor) -> Tensor:
         batch, (G, Ct), (rows, v_bar, *rest) = flatten_batch((G, Ct), (active, v_bar, lam_bar))
-        return adjoint(G, Ct, rows, v_bar, rest[0]).reshape(*batch, -1)
+        return adjoint(G, Ct, rows, v_bar, rest[0]).reshape(*batch, rows.shape[-1])
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
@@ -186,7 +186,7 @@ class SolveActive(torch.autograd.Function):
     @staticmethod
     def forward(rhs: Tensor, active: Tensor, G: Tensor, Ct: Tensor) -> Tensor:
         batch, (G, Ct), (rows, rhs) = flatten_batch((G, Ct), (active, rhs))
-        return solve_active(G, Ct, rows, rhs)[0].reshape(*batch, -1)
+        return solve_active(G, Ct, rows, rhs)[0].reshape(*batch, rhs.shape[-1])
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Tensor, ...], output: Tensor) -> None:

@@ -133,7 +133,7 @@ class DPCLayer(nn.Module):
             solver = solver.with_failures(on_failure)
         v, lam, _, info = solve_reduced(solver, theta, reduction, lower, upper)
         u, y = v.split((self.sizes.u, self.sizes.y), dim=-1)
-        u, y = (part.reshape(*part.shape[:-1], self.data.horizon, -1) for part in (u, y))
+        u, y = (x.reshape(*x.shape[:-1], self.data.horizon, n) for x, n in ((u, self.data.n_u), (y, self.data.n_y)))
         return DPCSolution(
             u=u if dtype == torch.float64 else u.to(dtype),
             y=y if dtype == torch.float64 else y.to(dtype),
@@ -239,7 +239,7 @@ class DPCLayer(nn.Module):
         basis = self.data.row_space.basis.to(a.device)
         if reduction.rows.C.requires_grad:  # g = D^+ (D g), so that the data behind D are differentiated too
             D = torch.cat([m.to(a) for m in self.data.matrices])
-            g = (a @ (D.detach() @ basis).mT) @ torch.linalg.pinv(D, rtol=1e-10).mT
+            g = times(torch.linalg.pinv(D, rtol=1e-10), times(D @ basis, a))
         else:
             g = a @ basis.mT
         return torch.where(info[..., :1] == Status.SOLVED, g, torch.nan)

@@ -25,6 +25,10 @@ from .reduction import Reduction
 #: are both at most this, relative to 1 + |bound|. Such a row counts as inactive in every derivative.
 WEAKLY_ACTIVE = 1e-9
 
+#: Where every term of the stationarity of g vanishes at the optimum (the plan meets its reference), what is left is the
+#: rounding of R (u - u_ref) and Q (y - y_ref): this fraction of |C| |(R, Q)| (|v| + |v_ref|) counts as a term too.
+CANCELLATION = 1e-6
+
 
 @dataclass(frozen=True)
 class Arithmetic:
@@ -95,6 +99,8 @@ class Optimality:
         self._R, self._Q = array(weights.R), array(weights.Q)
         self._weight_g, self._weight_s = array(2 * weights.lambda_g[..., None]), array(2 * weights.lambda_s[..., None])
         self._size_Up = float(rows.Up.norm())
+        largest = max(float(torch.linalg.matrix_norm(m, ord=2).max()) for m in (weights.R, weights.Q))
+        self._floor = CANCELLATION * largest * float(rows.C.norm())
 
     def unconstrained(self, theta: Any) -> tuple[Any, Any]:
         """Return the unconstrained minimiser, as a and as v = C a."""
@@ -130,7 +136,8 @@ class Optimality:
         of_M = self._weight_g * a[..., self._rank_W :]
         total = of_Yp - of_y_ini + of_w
         total[..., self._rank_W :] += of_M
-        stationary = norm(total @ self._Z) / (norm(of_Yp) + norm(of_y_ini) + norm(of_w) + norm(of_M) + _TINY)
+        terms = norm(of_Yp) + norm(of_y_ini) + norm(of_w) + norm(of_M) + self._floor * (norm(v) + norm(refs))
+        stationary = norm(total @ self._Z) / (terms + _TINY)
         return in_set + past + stationary
 
 

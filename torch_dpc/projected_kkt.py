@@ -121,7 +121,8 @@ class FullAdjoint(torch.autograd.Function):
     @staticmethod
     def forward(v_bar: Tensor, lam_bar: Tensor | None, active: Tensor, system: FullSystem) -> Tensor:
         batch, _, (rows, *bars) = flatten_batch((), (active, v_bar, lam_bar))
-        return system.adjoint(*bars, rows).reshape(*batch, -1)
+        theta_bar = system.adjoint(bars[0], bars[1], rows)
+        return theta_bar.reshape(*batch, theta_bar.shape[-1])
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:

@@ -27,6 +27,7 @@ from torch import Tensor
 
 from .hankel import HankelData
 from .saddle import Saddle, known_solution
+from .transforms import carries_derivative
 
 #: Singular values of E at or below this fraction of the largest make the optimum a set.
 COST_RANK_TOLERANCE = 1e-11
@@ -89,6 +90,12 @@ class DataRows:
     def of(data: HankelData, device: torch.device) -> DataRows:
         """Return the rows of the data; a graph behind the data matrices reaches through."""
         space = data.row_space
+        if not space.clear and carries_derivative(data.matrices):
+            raise ValueError(
+                "the data carry a graph, but their rank is not clear, and a derivative holds at constant rank only: the "
+                f"singular values around the decision are {space.last_kept:.1e} (kept) and {space.first_dropped:.1e} "
+                "(dropped), relative to the largest."
+            )
         basis = space.basis.to(device)
         Up, Yp, Uf, Yf = (m.to(device=device, dtype=torch.float64) @ basis for m in data.matrices)
         with torch.no_grad():

@@ -171,7 +171,7 @@ class Solver:
             if not (flag == SOLVED_FLAG and residual <= AS_GOOD_AS_POLISHED):  # NaN is not either
                 return None
             info[i] = Status.SOLVED, iterations, residual, n_active, n_weak
-        return Solved(*(torch.from_numpy(x.reshape(*batch, -1)) for x in (v, lam, active, info)))
+        return Solved(*(torch.from_numpy(x.reshape(*batch, x.shape[-1])) for x in (v, lam, active, info)))
 
     def _mark_failures(self, solved: Solved, rest: Tensor, theta: Tensor, lower: Tensor, upper: Tensor) -> None:
         """Look for certificates where both engines failed; leave NaN for v and nothing in the multipliers."""
