@@ -9,6 +9,7 @@ from torch import Tensor
 
 from .errors import Status
 from .layer import DPCLayer
+from .soften import plan_softened
 
 
 class DPCController:
@@ -20,8 +21,17 @@ class DPCController:
     Args:
         layer: the planning problem.
         replan_every: steps of a plan that are applied before the next one; at most the horizon.
-        on_failure: what to do when the problem has no solution: "raise", or "hold" to go on with the rest of the
-            previous plan, its last input held beyond its end (before any plan: the input nearest to zero in the set).
+        on_failure: what to do when the problem has no solution:
+            "raise": the layer's error;
+            "hold": go on with the rest of the previous plan, its last input held beyond its end (before any plan: the
+            input nearest to zero in the set);
+            "soften": widen the output bounds at the price `soft_weight` (:mod:`torch_dpc.soften`).
+        soft_weight: price of widening the output bounds by one unit, in units of the cost. Below it the plan is the one
+            without softening, so it should exceed the sum of the output multipliers of ordinary plans.
+
+    Attributes:
+        status: how the last problem, as posed, ended; what was done about it is up to `on_failure`.
+        softened_by: how far the output bounds were widened for the plan in force.
 
     Example:
         >>> from torch_dpc import Box, DPCController, DPCLayer, HankelData, collect, simulate, systems
@@ -33,17 +43,22 @@ class DPCController:
         torch.Size([20, 2])
     """
 
-    def __init__(self, layer: DPCLayer, replan_every: int = 10, *, on_failure: str = "raise"):
+    def __init__(
+        self, layer: DPCLayer, replan_every: int = 10, *, on_failure: str = "raise", soft_weight: float = 1e6
+    ):
         horizon = layer.data.horizon
         if not isinstance(replan_every, int) or not 1 <= replan_every <= horizon:
             raise ValueError(
                 f"`replan_every` must be an integer from 1 to the horizon, {horizon}, got {replan_every!r}."
             )
-        if on_failure not in ("raise", "hold"):
-            raise ValueError(f'`on_failure` must be "raise" or "hold", got {on_failure!r}.')
+        if on_failure not in ("raise", "hold", "soften"):
+            raise ValueError(f'`on_failure` must be "raise", "hold" or "soften", got {on_failure!r}.')
+        if not soft_weight > 0:
+            raise ValueError(f"`soft_weight` must be positive, got {soft_weight!r}.")
         self.layer = layer
         self.replan_every = replan_every
         self.on_failure = on_failure
+        self.soft_weight = soft_weight
         self.reset()
 
     def reset(self) -> None:
@@ -52,6 +67,7 @@ class DPCController:
         self._age = 0  # steps since the plan in force was made
         self._due = 0  # steps until the next one
         self.status = Status.SOLVED
+        self.softened_by = 0.0
 
     @property
     def replans_now(self) -> bool:
@@ -80,8 +96,11 @@ class DPCController:
     def _replan(self, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any) -> None:
         on_failure = "raise" if self.on_failure == "raise" else "nan"
         solution = self.layer(u_ini, y_ini, y_ref=y_ref, u_ref=u_ref, on_failure=on_failure)
-        self.status = Status(int(solution.info.status))
-        if self.status == Status.SOLVED:
+        self.status, self.softened_by = Status(int(solution.info.status)), 0.0
+        if self.status != Status.SOLVED and self.on_failure == "soften":
+            theta, _ = self.layer.flatten(u_ini, y_ini, y_ref, u_ref)
+            solution, self.softened_by = plan_softened(self.layer, theta, self.soft_weight)
+        if int(solution.info.status) == Status.SOLVED:
             self._plan, self._age = solution.u, 0
         elif self._plan is None:
             zero = torch.zeros(self.layer.data.n_u, dtype=solution.u.dtype, device=solution.u.device)

@@ -24,10 +24,10 @@ from torch import Tensor
 from .active_set import adjoint, solve_active
 from .errors import Status
 from .linear import flatten_batch, lead_all, outer, times
-from .transforms import carries_derivative, is_plain
 from .projected_kkt import FullAdjoint
 from .reduction import Reduction
 from .solve import Solved, Solver
+from .transforms import carries_derivative, is_plain
 
 
 def solve_reduced(solver: Solver, theta: Tensor, reduction: Reduction, lower: Tensor, upper: Tensor) -> Solved:
@@ -181,7 +181,7 @@ class SolveAdjoint(torch.autograd.Function):
 
 
 class SolveActive(torch.autograd.Function):
-    """(rhs, active, G, Ct) -> s with s_A = G_AA^-1 rhs_A and zero elsewhere: linear in rhs, symmetric, its own adjoint."""
+    """(rhs, active, G, Ct) -> s with s_A = G_AA^-1 rhs_A, zero elsewhere: linear in rhs and its own adjoint."""
 
     @staticmethod
     def forward(rhs: Tensor, active: Tensor, G: Tensor, Ct: Tensor) -> Tensor:

@@ -15,7 +15,7 @@ from .linear import times
 from .problem import CompactForm, Sizes, compact_form, penalty, stacked_bounds, weight_matrix
 from .projected_kkt import FullSystem
 from .reduction import DataRows, Reduction, Weights, reduce
-from .sets import Box, ConvexSet, Reals
+from .sets import Box, Reals
 from .solution import DPCSolution, SolveInfo
 from .solve import Solver
 from .transforms import carries_derivative
@@ -63,8 +63,8 @@ class DPCLayer(nn.Module):
         R: Any,
         lambda_g: Any,
         lambda_s: Any,
-        u_set: ConvexSet | None = None,
-        y_set: ConvexSet | None = None,
+        u_set: Box | None = None,
+        y_set: Box | None = None,
         *,
         backward: str = "reduced",
         solver: str = "auto",
@@ -78,11 +78,7 @@ class DPCLayer(nn.Module):
             raise ValueError(f"`data` must be a HankelData, got {type(data).__name__}.")
         self.data = data
         self.Q, self.R, self.lambda_g, self.lambda_s = Q, R, lambda_g, lambda_s
-        self.u_set = Reals() if u_set is None else u_set
-        self.y_set = Reals() if y_set is None else y_set
-        for name, value in (("u_set", self.u_set), ("y_set", self.y_set)):
-            if not isinstance(value, Box):
-                raise ValueError(f"`{name}` must be a Box, Reals or None, got {type(value).__name__}.")
+        self.u_set, self.y_set = _as_box("u_set", u_set), _as_box("y_set", y_set)
         self.backward_system = backward
         self.solver = solver
         self.on_failure = on_failure
@@ -93,7 +89,7 @@ class DPCLayer(nn.Module):
 
     @property
     def reduction(self) -> Reduction:
-        """The reduced problem of the present weights: V, G, Ct and what gives g back; see :mod:`torch_dpc.reduction`."""
+        """The reduced problem of the present weights; see :mod:`torch_dpc.reduction`."""
         return self._factors(self.data.Up.device)[0]
 
     @property
@@ -125,9 +121,27 @@ class DPCLayer(nn.Module):
             InfeasibleError: a sample has no solution, provably (with `on_failure="raise"`).
             SolveError: a sample could not be solved (likewise).
         """
-        theta, dtype = self._theta(u_ini, y_ini, y_ref, u_ref)
+        theta, dtype = self.flatten(u_ini, y_ini, y_ref, u_ref)
+        return self.plan(theta, *self.bounds(theta.device), dtype=dtype, on_failure=on_failure)
+
+    def plan(
+        self,
+        theta: Tensor,
+        lower: Tensor,
+        upper: Tensor,
+        *,
+        dtype: torch.dtype = torch.float64,
+        on_failure: str | None = None,
+    ) -> DPCSolution:
+        """Plan for flattened parameters and bounds of one's own; what a call does after its checks.
+
+        Args:
+            theta: (u_ini, y_ini, u_ref, y_ref) flattened, `(*batch, n_theta)`, float64.
+            lower, upper: bounds of (u, y) flattened, `(horizon (n_u + n_y),)` or one a sample, float64.
+            dtype: of the plan.
+            on_failure: in place of the layer's own.
+        """
         reduction, solver = self._factors(theta.device)
-        lower, upper = self._bounds(theta.device)
         if on_failure is not None and on_failure != solver.on_failure:
             _check_choice("on_failure", on_failure, ("raise", "nan"))
             solver = solver.with_failures(on_failure)
@@ -147,7 +161,7 @@ class DPCLayer(nn.Module):
 
         The arguments are those of the call. P is `(n, n)`, q `(*batch, n)`, H `(m, n)`, b `(*batch, m)`, float64.
         """
-        theta, _ = self._theta(u_ini, y_ini, y_ref, u_ref)
+        theta, _ = self.flatten(u_ini, y_ini, y_ref, u_ref)
         weights = self._weights(theta.device)
         if weights.Q.ndim + weights.R.ndim + weights.lambda_g.ndim + weights.lambda_s.ndim > 4:
             raise ValueError("`compact_form` takes one problem; the weights have a batch dimension.")
@@ -160,7 +174,7 @@ class DPCLayer(nn.Module):
             f"backward={self.backward_system!r}, solver={self.solver!r}, on_failure={self.on_failure!r}"
         )
 
-    def _theta(self, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any) -> tuple[Tensor, torch.dtype]:
+    def flatten(self, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any) -> tuple[Tensor, torch.dtype]:
         """Return (u_ini, y_ini, u_ref, y_ref) flattened, `(*batch, n_theta)` in float64, and the caller's dtype."""
         data = self.data
         u_ini = _window("u_ini", u_ini, data.t_ini, data.n_u, "n_u")
@@ -202,7 +216,8 @@ class DPCLayer(nn.Module):
         # The matrices of the data are constants of a frozen object: the object stands for them.
         return self._cached(("factors", device), (*weights, self.data), self._factor, device)
 
-    def _bounds(self, device: torch.device) -> tuple[Tensor, Tensor]:
+    def bounds(self, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Return the bounds of (u, y) flattened, `(horizon (n_u + n_y),)` each, float64, with their graph."""
         sources = (self.u_set.lower, self.u_set.upper, self.y_set.lower, self.y_set.upper)
         if carries_derivative(sources):
             return stacked_bounds(self.u_set, self.y_set, self.data, device)
@@ -248,6 +263,14 @@ class DPCLayer(nn.Module):
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
     if value not in choices:
         raise ValueError(f"`{name}` must be one of {', '.join(map(repr, choices))}, got {value!r}.")
+
+
+def _as_box(name: str, value: Any) -> Box:
+    if value is None:
+        return Reals()
+    if not isinstance(value, Box):
+        raise ValueError(f"`{name}` must be a Box, Reals or None, got {type(value).__name__}.")
+    return value
 
 
 def _window(name: str, value: Any, steps: int, channels: int, symbol: str) -> Tensor:

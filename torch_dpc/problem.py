@@ -107,7 +107,8 @@ def stacked_bounds(u_set: Box, y_set: Box, data: HankelData, device: torch.devic
     for name, box, channels in (("u_set", u_set, data.n_u), ("y_set", y_set, data.n_y)):
         box.check()
         shape = (data.horizon, channels)
-        for bounds, value in zip((lower, upper), box.bounds(torch.empty(0, dtype=torch.float64, device=device)), strict=True):
+        like = torch.empty(0, dtype=torch.float64, device=device)
+        for bounds, value in zip((lower, upper), box.bounds(like), strict=True):
             try:
                 whole = torch.broadcast_to(value, shape)
             except RuntimeError as error:

@@ -78,7 +78,7 @@ class DataRows:
     rank_W: int
 
     def unreachable(self, theta: Tensor) -> Tensor:
-        """Return which samples `(B,)` ask for a u_ini that no combination of the data produces."""
+        """Return which samples `(B,)` ask for a u_ini that no combination of the data makes."""
         u_ini = theta[..., : self.Up.shape[0]]
         if self.u_ini_range is None:
             return torch.zeros(u_ini.shape[:-1], dtype=torch.bool, device=u_ini.device)
@@ -92,8 +92,8 @@ class DataRows:
         space = data.row_space
         if not space.clear and carries_derivative(data.matrices):
             raise ValueError(
-                "the data carry a graph, but their rank is not clear, and a derivative holds at constant rank only: the "
-                f"singular values around the decision are {space.last_kept:.1e} (kept) and {space.first_dropped:.1e} "
+                "the data carry a graph, but their rank is not clear, and derivatives hold at constant rank: "
+                f"the singular values around the decision are {space.last_kept:.1e} (kept) and {space.first_dropped:.1e} "
                 "(dropped), relative to the largest."
             )
         basis = space.basis.to(device)

@@ -139,7 +139,8 @@ def simulate(
     data = controller.layer.data
     if (plant.n_u, plant.n_y) != (data.n_u, data.n_y):
         raise ValueError(
-            f"the plant has {plant.n_u} inputs and {plant.n_y} outputs, the controller's data {data.n_u} and {data.n_y}."
+            f"the plant has {plant.n_u} inputs and {plant.n_y} outputs, the controller's data {data.n_u} and "
+            f"{data.n_y}."
         )
     y_refs = _trajectory("y_ref", y_ref, steps, data.n_y, data.horizon)
     u_refs = _trajectory("u_ref", torch.zeros(data.n_u) if u_ref is None else u_ref, steps, data.n_u, data.horizon)
@@ -195,6 +196,7 @@ def _trajectory(name: str, value: Any, steps: int, channels: int, horizon: int) 
     elif tensor.ndim == 2 and len(tensor) < steps:
         raise ValueError(f"`{name}` must have at least `steps` = {steps} rows, got {len(tensor)}.")
     if tensor.ndim != 2 or tensor.shape[1] != channels:
-        raise ValueError(f"`{name}` must have shape ({channels},) or (>= steps, {channels}), got {tuple(tensor.shape)}.")
+        shapes = f"({channels},) or (>= steps, {channels})"
+        raise ValueError(f"`{name}` must have shape {shapes}, got {tuple(tensor.shape)}.")
     missing = max(steps + horizon - len(tensor), 0)
     return torch.cat([tensor, tensor[-1:].expand(missing, channels)])

@@ -17,33 +17,33 @@ class SolveInfo:
     """
 
     def __init__(self, table: Tensor, is_selection: bool):
-        self._table = table
+        self.table = table
         self.is_selection = is_selection
 
     @property
     def status(self) -> Tensor:
         """A :class:`torch_dpc.Status`, int64."""
-        return self._table[..., 0].long()
+        return self.table[..., 0].long()
 
     @property
     def iterations(self) -> Tensor:
         """Steps of the engine that found the solution, int64."""
-        return self._table[..., 1].long()
+        return self.table[..., 1].long()
 
     @property
     def residual(self) -> Tensor:
         """The paper's F at the solution, relative to its terms, Up g = u_ini included; float64."""
-        return self._table[..., 2]
+        return self.table[..., 2]
 
     @property
     def n_active(self) -> Tensor:
         """Rows of (u, y) held at a bound, int64."""
-        return self._table[..., 3].long()
+        return self.table[..., 3].long()
 
     @property
     def n_weakly_active(self) -> Tensor:
         """Rows that touch their bound without a multiplier, int64; derivatives treat them as free."""
-        return self._table[..., 4].long()
+        return self.table[..., 4].long()
 
     def __repr__(self) -> str:
         names = ("status", "iterations", "residual", "n_active", "n_weakly_active", "is_selection")
@@ -71,3 +71,8 @@ class DPCSolution:
     def g(self) -> Tensor:
         """The combination of the recorded windows, `(*batch, n_g)`; computed when first asked for."""
         return self._make_g()
+
+    def sample(self, i: int) -> DPCSolution:
+        """Return one sample of a batch."""
+        info = SolveInfo(self.info.table[i], self.info.is_selection)
+        return DPCSolution(self.u[i], self.y[i], info, self.lam[i], lambda: self.g[i])

@@ -113,7 +113,8 @@ class Solver:
         vectors = (theta,) if shared_bounds else (theta, lower, upper)
         batch, _, (samples, *bounds) = flatten_batch((self.reduction.G,), vectors)
         self._check_finite(samples)
-        solved = self._solve(samples, *(bounds or (lower, upper)), daqp_first=daqp_first)
+        lower, upper = bounds if bounds else (lower, upper)
+        solved = self._solve(samples, lower, upper, daqp_first)
         self._report(solved, batch)
         return Solved(*(x.reshape(*batch, x.shape[-1]) for x in solved))
 
@@ -196,7 +197,7 @@ class Solver:
         where = f"batch {'index' if len(places) == 1 else 'indices'} {_listed(places)}" if batch else "the problem"
         hint = 'on_failure="nan" marks such samples and returns the others.'
         if all(infeasible):
-            why = "no trajectory meets the constraints (a u_ini that the data cannot produce, or bounds that exclude it)"
+            why = "no trajectory meets the constraints (the data cannot produce u_ini, or the bounds exclude all)"
             raise InfeasibleError(f"{where}: {why}. {hint}", places)
         worst = float(solved.info[failed, 2].max())
         raise SolveError(

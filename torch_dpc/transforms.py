@@ -18,7 +18,7 @@ def is_plain(tensor: Tensor) -> bool:
 
 
 def carries_derivative(values: tuple[Any, ...]) -> bool:
-    """Return whether a derivative, backward or forward, may be asked with respect to one of the tensors among values."""
+    """Return whether a derivative, backward or forward, may be asked of one of the tensors among values."""
     tensors = [value for value in values if isinstance(value, Tensor)]
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
         return True
