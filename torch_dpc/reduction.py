@@ -92,8 +92,8 @@ class DataRows:
         space = data.row_space
         if not space.clear and carries_derivative(data.matrices):
             raise ValueError(
-                "the data carry a graph, but their rank is not clear, and derivatives hold at constant rank: "
-                f"the singular values around the decision are {space.last_kept:.1e} (kept) and {space.first_dropped:.1e} "
+                "the data carry a graph, but their rank is not clear, and derivatives hold at constant rank: the "
+                f"singular values around the decision are {space.last_kept:.1e} (kept) and {space.first_dropped:.1e} "
                 "(dropped), relative to the largest."
             )
         basis = space.basis.to(device)

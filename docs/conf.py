@@ -1,0 +1,9 @@
+"""Sphinx settings."""
+
+project = "torch_dpc"
+author = "The torch_dpc authors"
+extensions = ["myst_parser", "sphinx.ext.autodoc", "sphinx.ext.napoleon", "sphinx.ext.mathjax"]
+myst_enable_extensions = ["dollarmath", "amsmath"]
+html_theme = "furo"
+autodoc_member_order = "bysource"
+autodoc_typehints = "none"
