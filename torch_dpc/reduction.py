@@ -30,10 +30,10 @@ from .saddle import Saddle, known_solution
 from .transforms import carries_derivative
 
 #: Singular values of E at or below this fraction of the largest make the optimum a set.
-COST_RANK_TOLERANCE = 1e-11
-#: Weight on the kernel of E, relative to the largest singular value of E. Its square, 1e-10, is how far from the
+COST_RANK_TOLERANCE = 1e-14
+#: Weight on the kernel of E, relative to the largest singular value of E. Its square, 1e-12, is how far from the
 #: optimum (in relative cost curvature) the selected solution may be.
-TIE_BREAK = 1e-5
+TIE_BREAK = 1e-6
 #: How far u_ini may be from what the data can produce, relative to its norm.
 REACHABLE = 1e-8
 
@@ -167,6 +167,8 @@ def reduce(rows: DataRows, weights: Weights) -> Reduction:
         T, Qe, is_selection = _factor(E)
         Ct = torch.linalg.solve_triangular(T, rows.C @ rows.Z, upper=True, left=False)
         X_theta = torch.linalg.solve_triangular(T, Qe.mT @ e, upper=True)
+        # One step of refinement: it matters where weights of zero leave E a condition of 1e10.
+        X_theta = X_theta + torch.linalg.solve_triangular(T, Qe.mT @ (e - E @ X_theta), upper=True)
         A_theta = rows.Z @ X_theta
         A_theta[..., :, : rows.Up.shape[0]] += rows.Up_pinv
         A_lam = rows.Z @ torch.linalg.solve_triangular(T, Ct.mT, upper=True)
@@ -207,7 +209,7 @@ def _factor(E: Tensor) -> tuple[Tensor, Tensor, bool]:
     if E.shape[-2] >= E.shape[-1]:
         # A first cheap look at the diagonal: only a suspicious one pays for the singular values.
         diagonal = T.diagonal(dim1=-2, dim2=-1).abs()
-        if bool((diagonal.amin(-1) > 1e3 * COST_RANK_TOLERANCE * diagonal.amax(-1)).all()):
+        if bool((diagonal.amin(-1) > 1e4 * COST_RANK_TOLERANCE * diagonal.amax(-1)).all()):
             return T, Qe, False
     _, singular, right_h = torch.linalg.svd(E, full_matrices=True)
     largest = singular.amax(-1, keepdim=True)
