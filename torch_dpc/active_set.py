@@ -20,7 +20,7 @@ PIVOT_RATIO = 1e-5
 #: Rows of Ct that stand out of the span of the others by less than this fraction of their length are dependent.
 DEPENDENT_ROW = 1e-9
 #: Samples of like size that share one padded factorisation on the CPU.
-GROUP = 256
+GROUP = 128
 #: Up to this many samples NumPy, one after the other, beats the packing.
 FEW = 4
 
@@ -101,21 +101,27 @@ def solve_rows(G: np.ndarray, rows: np.ndarray, rhs: np.ndarray) -> np.ndarray |
 
 
 def _packed(G: Tensor, active: Tensor, rhs: Tensor) -> tuple[Tensor, Tensor]:
-    n = rhs.shape[1]
-    lam = torch.zeros_like(rhs)
-    trusted = torch.ones(len(rhs), dtype=torch.bool, device=rhs.device)
     count = active.sum(dim=1)
-    order = count.argsort()
-    # Samples of like size together: padding all to the largest would cost several times the flops.
-    group = GROUP if rhs.device.type == "cpu" else max(len(order), 1)
     table = _identity_padded(G)
-    for part in order.split(group):
-        index = _pack(active[part], count[part])
-        L, info = torch.linalg.cholesky_ex(_blocks(table, index, part))
-        x = torch.cholesky_solve(rhs[part].gather(1, index.clamp_max(n - 1))[..., None], L)[..., 0]
-        lam[part] = x.new_zeros(len(part), 2 * n).scatter_(1, index, x)[:, :n]
-        trusted[part] = (info == 0) & _pivots_are_clear(L, index < n)
+    if rhs.device.type != "cpu" or len(rhs) <= GROUP:
+        samples = torch.arange(len(rhs), device=rhs.device) if G.ndim == 3 else None
+        return _packed_group(table, active, rhs, count, samples)
+    # Samples of like size together: padding all to the largest would cost several times the flops.
+    lam, trusted = torch.zeros_like(rhs), torch.ones(len(rhs), dtype=torch.bool)
+    for part in count.argsort().split(GROUP):
+        lam[part], trusted[part] = _packed_group(table, active[part], rhs[part], count[part], part)
     return lam, trusted
+
+
+def _packed_group(
+    table: Tensor, active: Tensor, rhs: Tensor, count: Tensor, samples: Tensor | None
+) -> tuple[Tensor, Tensor]:
+    n = rhs.shape[1]
+    index = _pack(active, count)
+    L, info = torch.linalg.cholesky_ex(_blocks(table, index, samples))
+    x = torch.cholesky_solve(rhs.gather(1, index.clamp_max(n - 1))[..., None], L)[..., 0]
+    lam = x.new_zeros(len(rhs), 2 * n).scatter_(1, index, x)[:, :n]
+    return lam, (info == 0) & _pivots_are_clear(L, index < n)
 
 
 def _identity_padded(G: Tensor) -> Tensor:
@@ -138,11 +144,11 @@ def _pack(active: Tensor, count: Tensor) -> Tensor:
     return index
 
 
-def _blocks(table: Tensor, index: Tensor, samples: Tensor) -> Tensor:
+def _blocks(table: Tensor, index: Tensor, samples: Tensor | None) -> Tensor:
     """Return G[A, A] of each sample, `(b, k, k)`."""
     width = table.shape[-1]
     flat = index[:, :, None] * width + index[:, None, :]
-    if table.ndim == 3:
+    if table.ndim == 3 and samples is not None:
         flat = flat + samples[:, None, None] * width * width
     return table.reshape(-1).index_select(0, flat.reshape(-1)).reshape(flat.shape)
 

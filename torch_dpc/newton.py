@@ -53,27 +53,27 @@ def solve_newton(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor
         converged=torch.zeros(len(v0), dtype=torch.bool, device=v0.device),
     )
     todo = torch.arange(len(v0), device=v0.device)
-    tight = (lower == upper).expand_as(v0).any(dim=0)
     # Most rows never meet a bound: iterate on those that some sample violates or comes near, then look at all rows.
     near = torch.nan_to_num(NEAR * (upper - lower), posinf=0.0)
-    working = tight | _outside(v0, lower + near, upper - near).any(dim=0)
+    working = ((v0 > upper - near) | (v0 < lower + near) | (lower == upper)).any(dim=0)
+    slack_upper, slack_lower = upper + HYSTERESIS * (1 + upper.abs()), lower - HYSTERESIS * (1 + lower.abs())
     while len(todo):
         rows = working.nonzero()[:, 0]
-        G_rows = _take(G, todo)[..., rows, :]
-        lam, steps, converged = _iterate(
-            G_rows[..., rows],
-            _take(Ct, todo)[..., rows, :],
-            v0[todo][:, rows],
-            _take_bound(lower, todo)[..., rows],
-            _take_bound(upper, todo)[..., rows],
-        )
-        v = v0[todo] - _times(lam, G_rows)
-        violated = _outside(v, _take_bound(lower, todo), _take_bound(upper, todo))
+        everyone = len(todo) == len(v0)
+        samples = slice(None) if everyone else todo
+        G_rows = _take(G, samples)[..., rows, :]
+        problem = (G_rows[..., rows], _take(Ct, samples)[..., rows, :], v0[samples][:, rows])
+        bounds = (_take_bound(lower, samples)[..., rows], _take_bound(upper, samples)[..., rows])
+        lam, steps, converged = _iterate(*problem, *bounds)
+        v = v0[samples] - _times(lam, G_rows)
+        violated = (v > _take_bound(slack_upper, samples)) | (v < _take_bound(slack_lower, samples))
         violated[:, rows] = False
         finished = ~violated.any(dim=1)
         result.lam[todo[:, None], rows] = lam
-        result.iterations[todo] += steps
-        result.converged[todo] = converged & finished
+        result.iterations[samples] += steps
+        result.converged[samples] = converged & finished
+        if bool(finished.all()):
+            break
         working = working | violated.any(dim=0)
         todo = todo[~finished & converged]
     return result
@@ -86,60 +86,55 @@ def _iterate(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) ->
     converged = torch.zeros(len(v0), dtype=torch.bool, device=v0.device)
     if v0.shape[1] == 0:
         return lam_out, steps, ~converged
+    # A row is active where v + lam passes its bound by the hysteresis, or where its bounds leave no choice.
     tight = lower == upper
-    todo = torch.arange(len(v0), device=v0.device)
+    above = torch.where(tight, -torch.inf, upper + HYSTERESIS * (1 + upper.abs()))
+    below = lower - HYSTERESIS * (1 + lower.abs())
+    todo: Tensor | slice = slice(None)
     lam = _foresee(G, v0, lower, upper)
-    v = v0 - _times(lam, G)
-    target = torch.minimum(torch.maximum(v + lam, lower), upper)
+    pushed = v0 - _times(lam, G) + lam
+    active = (pushed > above) | (pushed < below)
     for step in range(1, MAX_STEPS + 1):
-        active = _is_active(v + lam - target, target, _take_bound(tight, todo))
-        lam, independent = solve_active(_take(G, todo), _take(Ct, todo), active, v0[todo] - target)
-        v = v0[todo] - _times(lam, _take(G, todo))
-        pushed = v + lam
-        target = torch.minimum(torch.maximum(pushed, _take_bound(lower, todo)), _take_bound(upper, todo))
-        # v = Proj(v + lam) up to rounding: the set asked for is the set solved on.
-        again = _is_active(pushed - target, target, _take_bound(tight, todo)) != active
-        stay = again.any(dim=1)
-        done = todo[~stay]
-        lam_out[done] = lam[~stay]
-        steps[done] = step
-        converged[done] = independent[~stay]
-        todo, lam, v, target = todo[stay], lam[stay], v[stay], target[stay]
-        if len(todo) == 0:
-            break
+        low, high = _take_bound(lower, todo), _take_bound(upper, todo)
+        G_todo, v0_todo = _take(G, todo), v0[todo]
+        target = torch.clamp(pushed, low, high)
+        lam, independent = solve_active(G_todo, _take(Ct, todo), active, v0_todo - target)
+        pushed = v0_todo - _times(lam, G_todo) + lam
+        again = (pushed > _take_bound(above, todo)) | (pushed < _take_bound(below, todo))
+        stay = (again != active).any(dim=1)
+        if not bool(stay.any()):
+            lam_out[todo], steps[todo], converged[todo] = lam, step, independent
+            return lam_out, steps, converged
+        left = torch.arange(len(v0), device=v0.device) if isinstance(todo, slice) else todo
+        done, todo = left[~stay], left[stay]
+        lam_out[done], steps[done], converged[done] = lam[~stay], step, independent[~stay]
+        pushed, active = pushed[stay], again[stay]
     steps[todo] = MAX_STEPS
     return lam_out, steps, converged
 
 
 def _foresee(G: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Return rough multipliers: Nesterov's method on their problem, step 1/|G|."""
+    """Return rough multipliers: Nesterov's method on their problem, step 1/|G|, the multipliers in units of that step."""
     G, v0, lower, upper = (x.float() for x in (G, v0, lower, upper))
     size = G.abs().sum(-1).amax(-1)  # a norm that bounds the largest eigenvalue
     size = torch.where(size > 0, size, 1.0)[..., None]
+    step = torch.eye(G.shape[-1], dtype=G.dtype, device=G.device) - G / size[..., None]
     lam = ahead = torch.zeros_like(v0)
     for k in range(GRADIENT_STEPS):
-        pushed = v0 - _times(ahead, G) + size * ahead
-        new = (pushed - torch.minimum(torch.maximum(pushed, lower), upper)) / size
+        pushed = torch.addmm(v0, ahead, step) if G.ndim == 2 else v0 + _times(ahead, step)
+        new = pushed - torch.clamp(pushed, lower, upper)
         ahead = torch.lerp(lam, new, 1 + k / (k + 3))
         lam = new
-    return lam.double()
-
-
-def _is_active(excess: Tensor, target: Tensor, tight: Tensor) -> Tensor:
-    return (excess.abs() > HYSTERESIS * (1 + target.abs())) | tight
-
-
-def _outside(v: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    return (v > upper + HYSTERESIS * (1 + upper.abs())) | (v < lower - HYSTERESIS * (1 + lower.abs()))
+    return (lam / size).double()
 
 
 def _times(lam: Tensor, G: Tensor) -> Tensor:
     return lam @ G if G.ndim == 2 else (lam[:, None, :] @ G)[:, 0]
 
 
-def _take(matrix: Tensor, samples: Tensor) -> Tensor:
+def _take(matrix: Tensor, samples: Tensor | slice) -> Tensor:
     return matrix if matrix.ndim == 2 else matrix[samples]
 
 
-def _take_bound(bound: Tensor, samples: Tensor) -> Tensor:
+def _take_bound(bound: Tensor, samples: Tensor | slice) -> Tensor:
     return bound if bound.ndim == 1 else bound[samples]
