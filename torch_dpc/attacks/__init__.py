@@ -3,6 +3,7 @@
 from .budgets import Ball, Box, Budget, Ellipsoid, RelativeBall
 from .costs import Cost, TargetInput
 from .gradient import LinearizedAttack
+from .iterative import FrankWolfeAttack, ProjectedGradientAttack
 from .random import RandomAttack
 
 __all__ = [
@@ -11,7 +12,9 @@ __all__ = [
     "Budget",
     "Cost",
     "Ellipsoid",
+    "FrankWolfeAttack",
     "LinearizedAttack",
+    "ProjectedGradientAttack",
     "RandomAttack",
     "RelativeBall",
     "TargetInput",
