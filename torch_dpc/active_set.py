@@ -59,6 +59,15 @@ def adjoint(G: Tensor, Ct: Tensor, active: Tensor, v_bar: Tensor, lam_bar: Tenso
     return v_bar + solve_active(G, Ct, active, rhs if lam_bar is None else rhs + lam_bar)[0]
 
 
+def adjoint_dense(G: Tensor, active: Tensor, v_bar: Tensor, lam_bar: Tensor | None) -> Tensor:
+    """Return what `adjoint` does in plain operations on all rows, slower; the active rows must be independent."""
+    held = active.to(G.dtype)
+    matrix = held[..., :, None] * G * held[..., None, :] + torch.diag_embed(1 - held)
+    rhs = -times(G, v_bar)
+    rhs = held * (rhs if lam_bar is None else rhs + lam_bar)
+    return v_bar + torch.linalg.solve(matrix, rhs[..., None])[..., 0]
+
+
 def _adjoint_few(G: np.ndarray, active: np.ndarray, bar: np.ndarray, lam_bar: np.ndarray | None) -> bool:
     """Turn v_bar into v0_bar in place; False where a system cannot be trusted."""
     for i, v_bar in enumerate(bar):

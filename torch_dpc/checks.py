@@ -41,3 +41,9 @@ def as_data(name: str, value: Any, *, finite: bool = True) -> Tensor:
 def is_finite(tensor: Tensor) -> bool:
     """Return whether every value is finite."""
     return bool(torch.isfinite(tensor.detach()).all())
+
+
+def check_count(name: str, value: Any) -> None:
+    """Raise ValueError unless the value is a positive integer."""
+    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
+        raise ValueError(f"`{name}` must be a positive integer, got {value!r}.")

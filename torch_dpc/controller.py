@@ -47,7 +47,7 @@ class DPCController:
         self, layer: DPCLayer, replan_every: int = 10, *, on_failure: str = "raise", soft_weight: float = 1e6
     ):
         horizon = layer.data.horizon
-        if not isinstance(replan_every, int) or not 1 <= replan_every <= horizon:
+        if not isinstance(replan_every, int) or isinstance(replan_every, bool) or not 1 <= replan_every <= horizon:
             raise ValueError(
                 f"`replan_every` must be an integer from 1 to the horizon, {horizon}, got {replan_every!r}."
             )

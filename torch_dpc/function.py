@@ -21,13 +21,13 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .active_set import adjoint, solve_active
+from .active_set import adjoint, adjoint_dense, solve_active
 from .errors import Status
 from .linear import flatten_batch, lead_all, outer, times
 from .projected_kkt import FullAdjoint
 from .reduction import Reduction
 from .solve import Solved, Solver
-from .transforms import carries_derivative, is_plain
+from .transforms import carries_derivative, is_grads_batched, is_plain
 
 
 def solve_reduced(solver: Solver, theta: Tensor, reduction: Reduction, lower: Tensor, upper: Tensor) -> Solved:
@@ -79,7 +79,9 @@ class SolveReduced(torch.autograd.Function):
             lam_bar = None if lam_bar is None else torch.where(solved, lam_bar, 0.0)
         if ctx.full is not None:
             return FullAdjoint.apply(v_bar, lam_bar, active, ctx.full), *(None,) * 7
-        if not torch.is_grad_enabled() and is_plain(v_bar):  # nothing will be derived again: spare the Function
+        if is_grads_batched(v_bar):
+            v0_bar = adjoint_dense(G, active, v_bar, lam_bar)
+        elif not torch.is_grad_enabled() and is_plain(v_bar):  # nothing will be derived again: spare the Function
             v0_bar = SolveAdjoint.forward(v_bar, lam_bar, active, G, Ct)
         else:
             v0_bar = SolveAdjoint.apply(v_bar, lam_bar, active, G, Ct)

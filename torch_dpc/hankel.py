@@ -17,7 +17,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .checks import as_data
+from .checks import as_data, check_count
 from .errors import ExcitationWarning
 from .rowspace import RowSpace, relative_tolerance
 
@@ -86,9 +86,8 @@ class HankelData:
         Warns:
             ExcitationWarning: the input is not persistently exciting of order t_ini + horizon.
         """
-        for name, value in (("t_ini", t_ini), ("horizon", horizon)):
-            if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-                raise ValueError(f"`{name}` must be a positive integer, got {value!r}.")
+        check_count("t_ini", t_ini)
+        check_count("horizon", horizon)
         u_list, y_list = _recordings(u, y)
         depth = t_ini + horizon
         for i, recording in enumerate(u_list):
@@ -117,7 +116,7 @@ class HankelData:
     @cached_property
     def row_space(self) -> RowSpace:
         """The factorisation of the stacked data, made once; see :class:`torch_dpc.rowspace.RowSpace`."""
-        with torch.no_grad():
+        with torch.inference_mode(False), torch.no_grad():
             return RowSpace.of(self)
 
     @property

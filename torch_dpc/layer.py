@@ -213,8 +213,9 @@ class DPCLayer(nn.Module):
         weights = (self.Q, self.R, self.lambda_g, self.lambda_s)
         if carries_derivative((*weights, *self.data.matrices)):
             return self._factor(device)
+        settings = (self.solver, self.on_failure, self.backward_system)
         # The matrices of the data are constants of a frozen object: the object stands for them.
-        return self._cached(("factors", device), (*weights, self.data), self._factor, device)
+        return self._cached(("factors", device), (*weights, *settings, self.data), self._factor, device)
 
     def bounds(self, device: torch.device) -> tuple[Tensor, Tensor]:
         """Return the bounds of (u, y) flattened, `(horizon (n_u + n_y),)` each, float64, with their graph."""
@@ -227,7 +228,7 @@ class DPCLayer(nn.Module):
         """Return what `make` makes of the sources, made anew when their values have changed."""
         entry = self._cache.get(key)
         if entry is None or not all(map(_is_same, entry[0], sources)):
-            with torch.no_grad():
+            with torch.inference_mode(False), torch.no_grad():  # later calls may differentiate
                 kept = tuple(s.detach().clone() if isinstance(s, Tensor) else s for s in sources)
                 entry = self._cache[key] = (kept, make(*args))
         return entry[1]
@@ -301,4 +302,4 @@ def _is_same(kept: Any, now: Any) -> bool:
     """Compare values: version counters would be cheaper, but miss edits through `.data`."""
     if isinstance(kept, Tensor) and isinstance(now, Tensor):
         return kept.shape == now.shape and kept.dtype == now.dtype and torch.equal(kept.to(now.device), now)
-    return kept is now or (isinstance(kept, (int, float)) and isinstance(now, (int, float)) and kept == now)
+    return kept is now or (isinstance(kept, (int, float, str)) and isinstance(now, (int, float, str)) and kept == now)

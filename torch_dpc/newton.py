@@ -114,7 +114,7 @@ def _iterate(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) ->
 
 
 def _foresee(G: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
-    """Return rough multipliers: Nesterov's method on their problem, step 1/|G|, the multipliers in units of that step."""
+    """Return rough multipliers: Nesterov's method with step 1/|G|, on multipliers in units of that step."""
     G, v0, lower, upper = (x.float() for x in (G, v0, lower, upper))
     size = G.abs().sum(-1).amax(-1)  # a norm that bounds the largest eigenvalue
     size = torch.where(size > 0, size, 1.0)[..., None]

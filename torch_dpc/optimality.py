@@ -39,12 +39,14 @@ class Arithmetic:
         norm: Euclidean norm of the last dimension.
         clip: (x, lower, upper) -> the nearest point between the bounds.
         combine: (lam, rows) -> lam' rows, where most of lam is zero.
+        where: (condition, yes, no) -> one or the other, entry by entry.
     """
 
     array: Callable[[torch.Tensor], Any]
     norm: Callable[[Any], Any]
     clip: Callable[[Any, Any, Any], Any]
     combine: Callable[[Any, Any], Any]
+    where: Callable[[Any, Any, Any], Any]
 
 
 BATCHED = Arithmetic(
@@ -52,12 +54,14 @@ BATCHED = Arithmetic(
     norm=lambda x: torch.linalg.vector_norm(x, dim=-1),
     clip=lambda x, lower, upper: torch.minimum(torch.maximum(x, lower), upper),
     combine=lambda lam, rows: _times(rows.mT, lam),
+    where=torch.where,
 )
 SINGLE = Arithmetic(
     array=lambda tensor: tensor.numpy(),
     norm=lambda x: (x @ x) ** 0.5,
     clip=lambda x, lower, upper: np.minimum(np.maximum(x, lower), upper),
     combine=lambda lam, rows: lam[held := lam.nonzero()[0]] @ rows[held],
+    where=np.where,
 )
 
 
@@ -91,6 +95,7 @@ class Optimality:
         rows, weights = reduction.rows, reduction.weights
         array = arithmetic.array
         self._norm, self._clip, self._combine = arithmetic.norm, arithmetic.clip, arithmetic.combine
+        self._where = arithmetic.where
         self._n_up, self._n_yp, self._n_u = rows.Up.shape[0], rows.Yp.shape[0], rows.Uf.shape[0]
         self._rank_W = rows.rank_W
         self._A_theta, self._A_lam = array(reduction.A_theta), array(reduction.A_lam.mT.contiguous())
@@ -112,6 +117,7 @@ class Optimality:
         a = a0 - self._combine(lam, self._A_lam)
         raw = _times(self._C, a)
         v = self._clip(raw, lower, upper)
+        v = self._where(lam > 0, upper, self._where(lam < 0, lower, v))  # to the last bit; the residual looks at raw
         residual = self._residual(theta, a, raw, v0, lam, lower, upper)
         reach = WEAKLY_ACTIVE * (1 + abs(v))
         # A difference to an infinite bound is infinite, and so never within reach.

@@ -138,8 +138,21 @@ class Reduction:
         weights = _map_tensors(self.weights, Tensor.detach)
         return replace(_map_tensors(self, Tensor.detach), rows=rows, weights=weights)
 
+    def of_batch(self, batch: torch.Size) -> Reduction:
+        """Return one problem a sample of a flattened batch; itself where all samples share one problem."""
+        if self.G.ndim == 2:
+            return self
+
+        def spread(x: Tensor, tail: int) -> Tensor:
+            own = x.shape[x.ndim - tail :]
+            return x.expand(*batch, *own).reshape(batch.numel(), *own)
+
+        w = self.weights
+        weights = Weights(spread(w.Q, 2), spread(w.R, 2), spread(w.lambda_g, 0), spread(w.lambda_s, 0))
+        return replace(_map_tensors(self, lambda x: spread(x, 2)), weights=weights)
+
     def of_samples(self, samples: Tensor) -> Reduction:
-        """Return the problems of some samples, where there is one problem a sample; itself otherwise."""
+        """Return the problems of some samples of a flattened batch; itself where all share one problem."""
         if self.G.ndim == 2:
             return self
         weights = _map_tensors(self.weights, lambda tensor: tensor[samples])

@@ -52,12 +52,11 @@ class Box(ConvexSet):
 
     def bounds(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """Return lower and upper as tensors of the dtype and on the device of another; graphs are kept."""
-        lower, upper = (torch.as_tensor(bound).to(like) for bound in (self.lower, self.upper))
-        return lower, upper
+        return _as_tensor(self.lower).to(like), _as_tensor(self.upper).to(like)
 
     def check(self) -> None:
         """Raise ValueError unless lower <= upper and a finite point lies between."""
-        lower, upper = (torch.as_tensor(bound).detach().double().cpu() for bound in (self.lower, self.upper))
+        lower, upper = (_as_tensor(bound).detach().double().cpu() for bound in (self.lower, self.upper))
         if not bool((lower <= upper).all()):
             raise ValueError("`lower` must be at most `upper` in every component, got crossed or NaN bounds.")
         if bool((lower == math.inf).any()) or bool((upper == -math.inf).any()):
@@ -103,6 +102,10 @@ def _as_bound(name: str, value: Any) -> Tensor | float:
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"`{name}` must be a number or an array of numbers, got {value!r}.") from error
     return tensor.item() if tensor.ndim == 0 else tensor
+
+
+def _as_tensor(bound: Tensor | float) -> Tensor:
+    return bound if isinstance(bound, Tensor) else torch.tensor(bound, dtype=torch.float64)
 
 
 def _short(bound: Tensor | float) -> str:

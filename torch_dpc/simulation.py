@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from .checks import as_data
+from .checks import as_data, check_count
 from .controller import DPCController
 
 
@@ -86,9 +86,8 @@ def collect(
         >>> u.shape, y.shape
         (torch.Size([5, 2]), torch.Size([5, 4]))
     """
-    for name, value in (("steps", steps), ("hold", hold)):
-        if not isinstance(value, int) or value < 1:
-            raise ValueError(f"`{name}` must be a positive integer, got {value!r}.")
+    check_count("steps", steps)
+    check_count("hold", hold)
     size = torch.as_tensor(amplitude, dtype=torch.float64).expand(plant.n_u)
     y = _start(plant, reset)
     inputs, outputs = [], []
@@ -136,6 +135,7 @@ def simulate(
         ValueError: references that do not fit.
         SolveError: from the controller.
     """
+    check_count("steps", steps)
     data = controller.layer.data
     if (plant.n_u, plant.n_y) != (data.n_u, data.n_y):
         raise ValueError(

@@ -105,7 +105,7 @@ class Solver:
         daqp_first = self._is_daqp_first(theta)
         if daqp_first and theta.ndim <= 2 and theta.device.type == "cpu" and lower.ndim == upper.ndim == 1:
             samples = theta.numpy().reshape(-1, theta.shape[-1])
-            if len(samples) <= FEW:
+            if len(samples) <= FEW and np.isfinite(samples).all():
                 quick = self._one_by_one(samples, lower.numpy(), upper.numpy(), theta.shape[:-1])
                 if quick is not None:
                     return quick
@@ -114,7 +114,8 @@ class Solver:
         batch, _, (samples, *bounds) = flatten_batch((self.reduction.G,), vectors)
         self._check_finite(samples)
         lower, upper = bounds if bounds else (lower, upper)
-        solved = self._solve(samples, lower, upper, daqp_first)
+        one_each = self if self.reduction.G.ndim == 2 else replace(self, reduction=self.reduction.of_batch(batch))
+        solved = one_each._solve(samples, lower, upper, daqp_first)
         self._report(solved, batch)
         return Solved(*(x.reshape(*batch, x.shape[-1]) for x in solved))
 

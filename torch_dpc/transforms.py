@@ -8,13 +8,23 @@ import torch
 from torch import Tensor
 from torch.autograd import forward_ad
 
-# Not public, but stable since torch 2.0; without it every tensor is taken to be wrapped, which is slower and right.
-_is_wrapped = getattr(getattr(torch._C, "_functorch", None), "is_functorch_wrapped_tensor", lambda tensor: True)
+# Not public, but stable since torch 2.0; without them every tensor is taken to be wrapped, which is slower and right.
+_functorch = getattr(torch._C, "_functorch", None)
+_is_wrapped = getattr(_functorch, "is_functorch_wrapped_tensor", lambda tensor: True)
+_is_legacy_batched = getattr(_functorch, "is_legacy_batchedtensor", lambda tensor: False)
 
 
 def is_plain(tensor: Tensor) -> bool:
     """Return whether a tensor holds its own numbers: no `vmap` or `torch.func` transform has wrapped it."""
-    return type(tensor) is Tensor and not _is_wrapped(tensor)
+    return type(tensor) is Tensor and not _is_wrapped(tensor) and not _is_legacy_batched(tensor)
+
+
+def is_grads_batched(tensor: Tensor) -> bool:
+    """Return whether a cotangent is one of many at once, from `torch.autograd.grad(..., is_grads_batched=True)`.
+
+    That is an older `vmap`, which does not look for the rules of a Function: its tensors stand plain operations alone.
+    """
+    return _is_legacy_batched(tensor)
 
 
 def carries_derivative(values: tuple[Any, ...]) -> bool:

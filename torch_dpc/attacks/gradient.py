@@ -70,7 +70,8 @@ class LinearizedAttack:
             step: of the run, for costs that move with it.
         """
         y_ini = as_data("y_ini", y_ini)
-        psi, gradient = psi_and_gradient(self.layer, self.cost, u_ini, y_ini, torch.zeros_like(y_ini), y_ref, u_ref, step)
+        nothing = torch.zeros_like(y_ini)
+        psi, gradient = psi_and_gradient(self.layer, self.cost, u_ini, y_ini, nothing, y_ref, u_ref, step)
         p = self.budget.minimize_linear(gradient, y_ini)
         promised = (gradient * p).sum((-2, -1)).abs()
         p = torch.where((promised > NOISE_FLOOR * psi.abs())[..., None, None], p, 0.0)
@@ -80,9 +81,9 @@ class LinearizedAttack:
 def psi_and_gradient(
     layer: DPCLayer, cost: Any, u_ini: Any, y_ini: Tensor, p: Tensor, y_ref: Any, u_ref: Any, step: int
 ) -> tuple[Tensor, Tensor]:
-    """Return psi(u*(p)), `(*batch,)`, and its gradient with respect to p; infinity and 0 where unsolved."""
-    with torch.enable_grad():
-        p = p.detach().requires_grad_()
+    """Return psi(u*(p)), `(*batch,)`, and its gradient in p; infinity and 0 where unsolved."""
+    with torch.inference_mode(False), torch.enable_grad():
+        p = p.detach().clone().requires_grad_()
         solution = layer(u_ini, y_ini.detach() + p, y_ref=y_ref, u_ref=u_ref, on_failure="nan")
         psi = at_step(cost, step)(solution)
         solved = solution.info.status == Status.SOLVED
