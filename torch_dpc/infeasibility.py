@@ -28,23 +28,33 @@ def infeasibility_certificate(Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tens
         v0, lower, upper: `(N,)`.
     """
     Ct, v0, lower, upper = (x.detach().cpu() for x in (Ct, v0, lower, upper))
-    left, singular, _ = torch.linalg.svd(Ct, full_matrices=False)
-    largest = float(singular.max()) if singular.numel() else 0.0
-    span = left[:, singular > DEPENDENT * largest]
+    scale = max(float(torch.linalg.matrix_norm(Ct, ord=2)), 1e-12) if Ct.numel() else 1.0
     no_equality = np.zeros(len(v0), dtype=bool)
     for eps in (1e-6, 1e-9, 1e-12):
-        soft = eps**0.5 * max(largest, 1e-12) * torch.eye(len(v0), dtype=Ct.dtype)
+        soft = eps**0.5 * scale * torch.eye(len(v0), dtype=Ct.dtype)
         workspace = Daqp(torch.cat([Ct, soft], dim=1))
         lam, flag, _ = workspace.solve((lower - v0).numpy(), (upper - v0).numpy(), no_equality)
-        if flag == SOLVED_FLAG and _separates(torch.from_numpy(lam), Ct, span, v0, lower, upper):
+        if flag != SOLVED_FLAG:
+            continue
+        d = torch.from_numpy(lam)
+        if any(_separates(c, Ct, v0, lower, upper) for c in (d, _in_kernel(d, Ct))):
             return True
     return False
 
 
-def _separates(d: Tensor, Ct: Tensor, span: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> bool:
+def _in_kernel(d: Tensor, Ct: Tensor) -> Tensor:
+    """Return the nearest direction with Ct' d = 0 that uses no other rows: those without a bound must stay out."""
+    used = d.nonzero()[:, 0]
+    left, singular, _ = torch.linalg.svd(Ct[used], full_matrices=False)
+    span = left[:, singular > DEPENDENT * singular.max()] if singular.numel() else left
+    out = torch.zeros_like(d)
+    out[used] = d[used] - span @ (span.T @ d[used])
+    return out
+
+
+def _separates(d: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> bool:
     norm = torch.linalg.vector_norm
     d = d / norm(d).clamp_min(torch.finfo(d.dtype).tiny)
-    d = torch.where(d == 0, d, d - span @ (span.T @ d))  # rows without a bound must stay out of it
     used = d != 0
     bound = torch.where(d > 0, upper, lower)[used]
     margin = (d * v0)[used].sum() - (d[used] * bound).sum()

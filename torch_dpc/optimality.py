@@ -27,7 +27,7 @@ WEAKLY_ACTIVE = 1e-9
 
 #: Where every term of the stationarity of g vanishes at the optimum (the plan meets its reference), what is left is the
 #: rounding of R (u - u_ref) and Q (y - y_ref): this fraction of |C| |(R, Q)| (|v| + |v_ref|) counts as a term too.
-CANCELLATION = 1e-6
+CANCELLATION = 1e-3
 
 
 @dataclass(frozen=True)
