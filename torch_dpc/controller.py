@@ -20,7 +20,8 @@ class DPCController:
 
     Args:
         layer: the planning problem.
-        replan_every: steps of a plan that are applied before the next one; at most the horizon.
+        replan_every: steps of a plan that are applied before the next one, at most the horizon; by default 10, or the
+            horizon where that is shorter.
         on_failure: what to do when the problem has no solution:
             "raise": the layer's error;
             "hold": go on with the rest of the previous plan, its last input held beyond its end (before any plan: the
@@ -44,9 +45,11 @@ class DPCController:
     """
 
     def __init__(
-        self, layer: DPCLayer, replan_every: int = 10, *, on_failure: str = "raise", soft_weight: float = 1e6
+        self, layer: DPCLayer, replan_every: int | None = None, *, on_failure: str = "raise", soft_weight: float = 1e6
     ):
         horizon = layer.data.horizon
+        if replan_every is None:
+            replan_every = min(10, horizon)
         if not isinstance(replan_every, int) or isinstance(replan_every, bool) or not 1 <= replan_every <= horizon:
             raise ValueError(
                 f"`replan_every` must be an integer from 1 to the horizon, {horizon}, got {replan_every!r}."

@@ -287,15 +287,14 @@ def _window(name: str, value: Any, steps: int, channels: int, symbol: str) -> Te
 def _reference(name: str, value: Any, steps: int, channels: int, symbol: str, like: Tensor) -> Tensor:
     if value is None:
         return like.new_zeros(()).expand(steps, channels)
-    tensor = as_data(name, value, finite=False)
-    tail = tensor.shape[-2:]
-    if tensor.ndim == 0 or tail[-1] != channels or (len(tail) == 2 and tail[0] not in (1, steps)):
+    tensor = as_data(name, value, finite=False).to(like.device)
+    try:
+        return tensor.expand(*tensor.shape[:-2], steps, channels)
+    except RuntimeError as error:
         raise ValueError(
             f"`{name}` must broadcast to (*batch, horizon, {symbol}) = (*, {steps}, {channels}), "
             f"got {tuple(tensor.shape)}."
-        )
-    tensor = tensor.to(like.device)
-    return tensor.expand(steps, channels) if tensor.ndim == 1 else tensor.expand(*tensor.shape[:-2], steps, channels)
+        ) from error
 
 
 def _is_same(kept: Any, now: Any) -> bool:

@@ -28,6 +28,9 @@ WEAKLY_ACTIVE = 1e-9
 #: Where every term of the stationarity of g vanishes at the optimum (the plan meets its reference), what is left is the
 #: rounding of R (u - u_ref) and Q (y - y_ref): this fraction of |C| |(R, Q)| (|v| + |v_ref|) counts as a term too.
 CANCELLATION = 1e-3
+#: 2 lambda_s Yp'Yp a cannot be evaluated to better than a few units in the last place of lambda_s |Yp|^2 |a|; relative
+#: to the accepted residual, 1e-8, that is this fraction.
+ROUNDING = 1e-6
 
 
 @dataclass(frozen=True)
@@ -106,6 +109,7 @@ class Optimality:
         self._size_Up = float(rows.Up.norm())
         largest = max(float(torch.linalg.matrix_norm(m, ord=2).max()) for m in (weights.R, weights.Q))
         self._floor = CANCELLATION * largest * float(rows.C.norm())
+        self._rounding = ROUNDING * float(weights.lambda_s.max()) * float(rows.Yp.norm()) ** 2
 
     def unconstrained(self, theta: Any) -> tuple[Any, Any]:
         """Return the unconstrained minimiser, as a and as v = C a."""
@@ -142,7 +146,8 @@ class Optimality:
         of_M = self._weight_g * a[..., self._rank_W :]
         total = of_Yp - of_y_ini + of_w
         total[..., self._rank_W :] += of_M
-        terms = norm(of_Yp) + norm(of_y_ini) + norm(of_w) + norm(of_M) + self._floor * (norm(v) + norm(refs))
+        terms = norm(of_Yp) + norm(of_y_ini) + norm(of_w) + norm(of_M)
+        terms = terms + self._floor * (norm(v) + norm(refs)) + self._rounding * norm(a)
         stationary = norm(total @ self._Z) / (terms + _TINY)
         return in_set + past + stationary
 

@@ -103,12 +103,11 @@ class Solver:
             InfeasibleError, SolveError: with `on_failure="raise"`, if a sample has no accepted solution.
         """
         daqp_first = self._is_daqp_first(theta)
-        if daqp_first and theta.ndim <= 2 and theta.device.type == "cpu" and lower.ndim == upper.ndim == 1:
+        if daqp_first and self._are_few(theta, lower, upper):
             samples = theta.numpy().reshape(-1, theta.shape[-1])
-            if len(samples) <= FEW and np.isfinite(samples).all():
-                quick = self._one_by_one(samples, lower.numpy(), upper.numpy(), theta.shape[:-1])
-                if quick is not None:
-                    return quick
+            quick = self._one_by_one(samples, lower.numpy(), upper.numpy(), theta.shape[:-1])
+            if quick is not None:
+                return quick
         shared_bounds = lower.ndim == upper.ndim == 1
         vectors = (theta,) if shared_bounds else (theta, lower, upper)
         batch, _, (samples, *bounds) = flatten_batch((self.reduction.G,), vectors)
@@ -145,6 +144,12 @@ class Solver:
         suits = theta.device.type == "cpu" and count <= DAQP_BATCH and self._daqp is not None
         return self.engine == "daqp" or (self.engine == "auto" and suits)
 
+    def _are_few(self, theta: Tensor, lower: Tensor, upper: Tensor) -> bool:
+        """Whether NumPy can take the samples one by one: few, on the CPU, and nothing to look at sample by sample."""
+        shared = lower.ndim == upper.ndim == 1 and self.reduction.rows.u_ini_range is None
+        few = theta.numel() <= FEW * theta.shape[-1] and theta.device.type == "cpu"
+        return shared and few and bool(np.isfinite(theta.numpy()).all())
+
     def _engine(self, daqp: bool) -> Engine:
         return partial(solve_daqp, workspace=self._daqp) if daqp else solve_newton
 
@@ -153,7 +158,7 @@ class Solver:
         a0, v0 = self._batched.unconstrained(theta)
         found = engine(self.reduction.G, self.reduction.Ct, v0, lower, upper)
         judged = self._batched.judge(theta, a0, v0, found.lam, lower, upper)
-        failed = ~(found.converged & (judged.residual <= ACCEPTED))
+        failed = ~(found.converged & (judged.residual <= ACCEPTED)) | self.reduction.rows.unreachable(theta)
         info = [failed * Status.FAILED, found.iterations, judged.residual, judged.n_active, judged.n_weakly_active]
         return Solved(judged.v, found.lam, judged.active, torch.stack([i.double() for i in info], dim=-1))
 
