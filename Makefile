@@ -27,7 +27,7 @@ reproduce: $(ENV)  ## the paper's figures and tables, into results/
 
 test: $(ENV)  ## every test and docstring example (ARGS="-m 'not slow'" for the quick ones)
 	@ignore=; $(PY) -c 'import pybullet' 2>/dev/null || ignore=--ignore=torch_dpc/systems/quadrotor.py; \
-	set -x; $(PY) -m pytest tests --doctest-modules torch_dpc $$ignore $(ARGS)
+	set -x; $(PY) -m pytest tests --doctest-modules torch_dpc baselines $$ignore $(ARGS)
 
 bench: $(ENV)  ## time and error of the layer (ARGS=--quick for a short run)
 	$(PY) scripts/benchmark.py $(ARGS)

@@ -5,12 +5,12 @@ from __future__ import annotations
 from pathlib import Path
 
 import numpy as np
-from _common import NOMINAL, POISON, Array, Rows, grid
-from _plots import NAMES, percent, plt, style
 from matplotlib import patheffects
 from matplotlib.animation import PillowWriter
 from tqdm import tqdm
 
+from _common import NOMINAL, POISON, Array, Rows, grid
+from _plots import NAMES, percent, plt, style
 from torch_dpc.systems import Quadrotor
 
 WIDTH, HEIGHT = 320, 260  # of each picture [pixels]

@@ -11,9 +11,10 @@ import matplotlib
 matplotlib.use("Agg")  # files only: no display needed
 
 import matplotlib.pyplot as plt  # noqa: E402
-from _common import NOMINAL, POISON, RANDOM, Array, Rows, band, grid  # noqa: E402
 from matplotlib.axes import Axes  # noqa: E402
 from matplotlib.ticker import MultipleLocator  # noqa: E402
+
+from _common import NOMINAL, POISON, RANDOM, Array, Rows, band, grid  # noqa: E402
 
 # Light to dark as rho grows, and apart in hue as well, for every kind of colour vision and in grey.
 RHO_COLOURS = ("#f2a33a", "#c8407a", "#35178c")

@@ -19,6 +19,8 @@ from pathlib import Path
 from typing import Any
 
 import torch
+
+import torch_dpc as dpc
 from _common import (
     ATTACK_SEED,
     NOMINAL,
@@ -37,8 +39,6 @@ from _common import (
     write_rows,
 )
 from _plots import error_panels
-
-import torch_dpc as dpc
 
 T_INI, HORIZON, N_G = 6, 25, 500
 SAMPLES = N_G + T_INI + HORIZON - 1

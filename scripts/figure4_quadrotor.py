@@ -23,6 +23,9 @@ from pathlib import Path
 from typing import Any
 
 import torch
+from torch import Tensor
+
+import torch_dpc as dpc
 from _common import (
     ATTACK_SEED,
     NOMINAL,
@@ -42,9 +45,6 @@ from _common import (
 )
 from _film import film
 from _plots import NAMES, crash_steps, error_panels, paths_from_above, percent
-from torch import Tensor
-
-import torch_dpc as dpc
 
 T_INI, HORIZON, N_G = 6, 25, 500
 SAMPLES = N_G + T_INI + HORIZON - 1

@@ -18,9 +18,10 @@ import time
 from pathlib import Path
 from typing import Any
 
+import numpy as np
+
 import figure3_masses
 import figure4_quadrotor
-import numpy as np
 from _common import (
     NOMINAL,
     POISON,

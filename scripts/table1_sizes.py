@@ -1,6 +1,6 @@
 """Table I: the size of the system that each method solves to differentiate one plan.
 
-    python scripts/table1_sizes.py          # about TODO s on two cores
+    python scripts/table1_sizes.py          # about 10 s on two cores
 
 Every number is read off what is solved, none is computed from a formula: from CVXPYlayers' own canonicalised cone
 program (m rows and n variables make a homogeneous self-dual embedding of m + n + 1), from the Jacobian J of the paper's

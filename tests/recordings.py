@@ -29,7 +29,6 @@ def fly_again():
     """Return the same from the simulator."""
     sys.path.insert(0, str(ROOT.parent / "scripts"))
     from figure4_quadrotor import LiesWhereItCrashed, record
-
     from torch_dpc.systems import Quadrotor
 
     with Quadrotor() as plant:

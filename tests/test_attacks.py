@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import torch
-from helpers import HOLDING, Y_REF, central, generator, masses_data, paper_layer, randn, relative, small_layer, windows
 
 import torch_dpc as dpc
+from helpers import HOLDING, Y_REF, central, generator, masses_data, paper_layer, randn, relative, small_layer, windows
 from torch_dpc import attacks
 
 EXACT = 1e-10

@@ -7,11 +7,11 @@ from pathlib import Path
 
 import pytest
 import torch
-from helpers import HOLDING, Y_REF, paper_layer, randn, relative, small_layer, windows
 
 import baselines
 import torch_dpc as dpc
 from baselines import PEERS, CvxpyLayersDPC, ForwardOnlyDPC, FullKKT, QPLayerDPC, QpthDPC
+from helpers import HOLDING, Y_REF, paper_layer, randn, relative, small_layer, windows
 
 # diffcp copies tensors into NumPy arrays in a way that NumPy 2 warns of.
 pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")

@@ -2,9 +2,9 @@
 
 import pytest
 import torch
-from helpers import HOLDING, SMALL, Y_REF, generator, relative, small_data, small_layer
 
 import torch_dpc as dpc
+from helpers import HOLDING, SMALL, Y_REF, generator, relative, small_data, small_layer
 
 EXACT = 1e-10
 T_INI = 3

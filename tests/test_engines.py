@@ -4,6 +4,9 @@ import threading
 
 import pytest
 import torch
+from torch.func import jacfwd, jacrev
+
+import torch_dpc as dpc
 from helpers import (
     HOLDING,
     PAPER,
@@ -19,9 +22,6 @@ from helpers import (
     small_layer,
     windows,
 )
-from torch.func import jacfwd, jacrev
-
-import torch_dpc as dpc
 
 ENGINES = ["auto", "newton", "daqp"]
 SAME = 1e-10  # engines end in one common polish or exact multipliers

@@ -2,6 +2,8 @@
 
 import pytest
 import torch
+
+import torch_dpc as dpc
 from helpers import (
     HOLDING,
     PAPER,
@@ -16,8 +18,6 @@ from helpers import (
     small_layer,
     windows,
 )
-
-import torch_dpc as dpc
 
 #: The samples that remain are those of the batch without the failed one, to this.
 UNTOUCHED = 1e-12

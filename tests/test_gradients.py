@@ -2,10 +2,10 @@
 
 import pytest
 import torch
-from helpers import HOLDING, Y_REF, central, model_plan, paper_layer, randn, relative, small_layer, windows
 from torch.func import grad, hessian, jacfwd, jacrev, jvp, vmap
 
 import torch_dpc as dpc
+from helpers import HOLDING, Y_REF, central, model_plan, paper_layer, randn, relative, small_layer, windows
 
 #: The solution is affine in its data between kinks: differences lose only rounding over their step.
 DIFFERENCES = 1e-6

@@ -5,9 +5,9 @@ import warnings
 import numpy as np
 import pytest
 import torch
-from helpers import generator, masses_data, randn, relative, small_data
 
 import torch_dpc as dpc
+from helpers import generator, masses_data, randn, relative, small_data
 from torch_dpc.problem import projector
 
 EXACT = 1e-10

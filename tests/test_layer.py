@@ -7,9 +7,9 @@ import pickle
 import numpy as np
 import pytest
 import torch
-from helpers import SMALL, Y_REF, delayed_layer, delayed_windows, randn, relative, small_data, small_layer, windows
 
 import torch_dpc as dpc
+from helpers import SMALL, Y_REF, delayed_layer, delayed_windows, randn, relative, small_data, small_layer, windows
 
 SAME = 1e-10
 #: Single precision in and out: the last digit of the answer, through the rounding of the measurements.

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 import torch
+
+import torch_dpc as dpc
 from helpers import (
     HOLDING,
     SMALL,
@@ -18,8 +20,6 @@ from helpers import (
     small_layer,
     windows,
 )
-
-import torch_dpc as dpc
 
 #: F relative to its terms, 1e-8 at most. A w found here by least squares is no better than its condition (lambda_s).
 F_TOLERANCE = {"lam": 1e-10, "least squares": 1e-9}

@@ -3,6 +3,8 @@
 import numpy as np
 import pytest
 import torch
+
+import torch_dpc as dpc
 from helpers import (
     HOLDING,
     SMALL,
@@ -17,8 +19,6 @@ from helpers import (
     small_layer,
     windows,
 )
-
-import torch_dpc as dpc
 from torch_dpc.reduction import DataRows, reduce
 
 EXACT = 1e-10

@@ -65,7 +65,8 @@ def adjoint_dense(G: Tensor, active: Tensor, v_bar: Tensor, lam_bar: Tensor | No
     matrix = held[..., :, None] * G * held[..., None, :] + torch.diag_embed(1 - held)
     rhs = -times(G, v_bar)
     rhs = held * (rhs if lam_bar is None else rhs + lam_bar)
-    return v_bar + torch.linalg.solve(matrix, rhs[..., None])[..., 0]
+    # Not `linalg.solve`: torch's batched LU is unsound on several threads (its issue 141358), Cholesky is not.
+    return v_bar + torch.cholesky_solve(rhs[..., None], torch.linalg.cholesky(matrix))[..., 0]
 
 
 def _adjoint_few(G: np.ndarray, active: np.ndarray, bar: np.ndarray, lam_bar: np.ndarray | None) -> bool:

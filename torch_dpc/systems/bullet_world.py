@@ -5,6 +5,8 @@ import importlib.resources
 import os
 import sys
 import weakref
+from collections.abc import Iterator
+from contextlib import contextmanager
 from types import ModuleType
 from typing import Any, NamedTuple
 
@@ -129,13 +131,31 @@ class BulletWorld:
 
 def _import_pybullet() -> ModuleType:
     try:
-        return importlib.import_module("pybullet")
+        with _silent_c_output():
+            return importlib.import_module("pybullet")
     except ImportError as error:
         version = f"{sys.version_info.major}.{sys.version_info.minor}"
         raise ImportError(
             "the quadrotor needs PyBullet: `pip install torch_dpc[quadrotor]`. "
             f"PyBullet has wheels only up to Python 3.11; this is Python {version}."
         ) from error
+
+
+@contextmanager
+def _silent_c_output() -> Iterator[None]:
+    """Keep from the terminal the build time that PyBullet's C code prints when it is first imported."""
+    if "pybullet" in sys.modules:
+        yield
+        return
+    sys.stdout.flush()
+    kept, nowhere = os.dup(1), os.open(os.devnull, os.O_WRONLY)
+    try:
+        os.dup2(nowhere, 1)
+        yield
+    finally:
+        os.dup2(kept, 1)
+        os.close(kept)
+        os.close(nowhere)
 
 
 def _connect(bullet: ModuleType, gui: bool) -> int:

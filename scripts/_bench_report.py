@@ -1,0 +1,156 @@
+"""The tables and the picture of benchmark.csv."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+from _bench_cases import LOOP, OURS, PERTURBATION
+from _bench_scatter import scatter
+
+Line = dict[str, str]
+
+HOW = f"""Times are medians in ms, with the quartiles in brackets, of calls one after the other; *forward* is a call
+without a graph, *both* is forward and backward of sum(u) with a graph on y_ini, *a problem* is a time divided by the
+batch. A batch of one takes 16 problems in turn. *Setup*: torch_dpc from the recorded trajectories to the first call;
+a peer, what it needs on top of that. *Memory* is the peak above what the process held after its imports. *Size* is that
+of the system solved to differentiate. The problems are windows of the recording with y_ini perturbed by
+{PERTURBATION["masses"]:.0%} (masses) and {PERTURBATION["quadrotor"]:.1%} (quadrotor), and the references of the
+figures. *Errors* are relative, of the plan (u, y) and of d sum(u) / d y_ini, the largest over up to 4 problems, against
+a reference in extended precision (`scripts/_reference.py`) whose own error is estimated at {{reference}} or less.
+"(paper)" is the QP as the paper prints it, "(reduced)" our least-distance form."""
+
+
+def write_report(out: Path, lines: list[Line]) -> str:
+    """Write benchmark.md and benchmark.png; return the first table."""
+    shown = [line for line in lines if line["scaling"] == "False"]
+    head = ["# Benchmark", "", *_made_with(lines), "", _how(lines)]
+    first = ["## torch_dpc against the others", "", *_ratios(shown)]
+    body = [*_scaling([line for line in lines if line["scaling"] == "True"]), *_all(shown)]
+    (out / "benchmark.md").write_text("\n".join([*head, "", *first, "", *body]) + "\n")
+    chosen = _of(shown, plant="masses", horizon="25", batch="1")
+    if any(line["gradient_error"] and line["both_ms"] for line in chosen):
+        scatter(out / "benchmark.png", chosen)
+    return "\n".join(first[2:])
+
+
+def _made_with(lines: list[Line]) -> list[str]:
+    told = []
+    for names in (("processor", "threads", "seed", "mode"), ("versions",)):
+        parts = [f"{name} {' or '.join(dict.fromkeys(line[name] for line in lines))}" for name in names]
+        told.append("; ".join(parts).removeprefix("processor ").removeprefix("versions ") + ".")
+    return told
+
+
+def _how(lines: list[Line]) -> str:
+    known = [float(line["reference_error"]) for line in lines if line["reference_error"]]
+    return HOW.format(reference=f"{max(known):.0e}" if known else "an unknown amount")
+
+
+def _ratios(lines: list[Line]) -> list[str]:
+    """The layer with its default engine, beside the loop over DAQP and the fastest differentiable peer."""
+    header = ["plant", "horizon", "batch", "forward", "a problem [us]", "DAQP loop", "ratio", "both", "a problem [us]"]
+    header += ["gradient error", "fastest differentiable peer", "its both", "ratio", "its gradient error"]
+    rows = []
+    for ours in _of(lines, name="torch_dpc"):
+        same = _of(lines, plant=ours["plant"], horizon=ours["horizon"], batch=ours["batch"])
+        loop = next(iter(_of(same, name=LOOP)), None)
+        peers = [line for line in same if line["name"] not in OURS and line["both_ms"] and line["status"] == "ok"]
+        peer = min(peers, key=lambda line: float(line["both_ms"]), default=None)
+        row = [ours["plant"], ours["horizon"], ours["batch"], _number(ours["forward_ms"]), _each(ours, "forward_ms")]
+        row += [_number(loop["forward_ms"]), _ratio(loop, ours, "forward_ms")] if loop else ["", ""]
+        row += [_number(ours["both_ms"]), _each(ours, "both_ms"), _number(ours["gradient_error"], ".0e")]
+        row += [peer["name"], _number(peer["both_ms"]), _ratio(peer, ours, "both_ms")] if peer else [""] * 3
+        rows.append([*row, _number(peer["gradient_error"], ".0e") if peer else ""])
+    lead = _table(header, rows, left=("plant", "fastest differentiable peer"))
+    return [*lead, "", *_cvxpylayers(lines), "A ratio is theirs to ours: above 1, torch_dpc is faster."]
+
+
+def _cvxpylayers(lines: list[Line]) -> list[str]:
+    chosen = _of(lines, plant="masses", horizon="25", batch="1")
+    ours = next((line for line in _of(chosen, name="torch_dpc") if line["both_ms"]), None)
+    theirs = [line for line in chosen if "cvxpylayers" in line["name"] and "(paper)" in line["name"]]
+    theirs = [line for line in theirs if line["both_ms"] and line["status"] == "ok"]
+    if ours is None or not theirs:
+        return []
+    best = min(theirs, key=lambda line: float(line["both_ms"]))
+    return [
+        f"On the masses' QP as the paper prints it (horizon 25, batch 1) the fastest of {len(theirs)} cvxpylayers "
+        f"configurations measured, {best['name']}, takes {_ratio(best, ours, 'both_ms')} times as long, "
+        f"with a gradient error of {_number(best['gradient_error'], '.0e')}.",
+        "",
+    ]
+
+
+def _scaling(lines: list[Line]) -> list[str]:
+    if not lines:
+        return []
+    header = ["recorded windows n_g", "setup [s]", "memory [MB]", "forward", "ratio to n_g = 500", "solution error"]
+    rows = []
+    for line in sorted(lines, key=lambda line: int(line["n_g"])):
+        setup = _number(str(float(line["setup_ms"]) / 1e3)) if line["setup_ms"] else line["status"]
+        row = [line["n_g"], setup, _number(line["peak_mb"]), _spread(line, "forward"), _number(line["ratio"], ".2f")]
+        rows.append([*row, _number(line["solution_error"], ".0e")])
+    text = "The masses at horizon 25, batch 1; the layer on 500 windows is called turn by turn beside each."
+    return ["## More recorded windows", "", *_table(header, rows), "", text, ""]
+
+
+def _all(lines: list[Line]) -> list[str]:
+    header = ["solver", "setup", "forward", "backward", "both", "a problem [us]", "memory [MB]", "size"]
+    header += ["solution error", "gradient error", "repeats", "remarks"]
+    out = []
+    problems = dict.fromkeys((line["plant"], int(line["horizon"]), int(line["batch"])) for line in lines)
+    for plant, horizon, batch in sorted(problems):
+        rows = []
+        for line in _of(lines, plant=plant, horizon=str(horizon), batch=str(batch)):
+            each = _each(line, "both_ms") or _each(line, "forward_ms")
+            row = [line["name"], _number(line["setup_ms"])]
+            row += [_spread(line, stage) for stage in ("forward", "backward", "both")]
+            row += [each, _number(line["peak_mb"]), line["kkt_size"]]
+            row += [_number(line[f"{name}_error"], ".0e") for name in ("solution", "gradient")]
+            rows.append([*row, line["repeats"], _remark(line)])
+        out += [f"## {plant}, horizon {horizon}, batch {batch}", ""]
+        out += [*_table(header, rows, left=("solver", "remarks")), ""]
+    return out
+
+
+def _remark(line: Line) -> str:
+    status = "" if line["status"] == "ok" else line["status"]
+    message = line["message"].replace("|", "/").replace("\n", " ")
+    message = message if len(message) <= 120 else message[:117] + "..."
+    return ": ".join(part for part in (status, message) if part)
+
+
+# --- cells -----------------------------------------------------------------------------------------------------------
+
+
+def _of(lines: Iterable[Line], **values: str) -> list[Line]:
+    return [line for line in lines if all(line[name] == value for name, value in values.items())]
+
+
+def _number(cell: str, form: str = ".3g") -> str:
+    if not cell:
+        return ""
+    value = float(cell)
+    return f"{value:,.0f}" if form == ".3g" and value >= 1000 else f"{value:{form}}"
+
+
+def _spread(line: Line, stage: str) -> str:
+    if not line[f"{stage}_ms"]:
+        return ""
+    low, high = _number(line[f"{stage}_q1"]), _number(line[f"{stage}_q3"])
+    return _number(line[f"{stage}_ms"]) + (f" ({low} to {high})" if low else "")
+
+
+def _each(line: Line, time: str) -> str:
+    return _number(str(1e3 * float(line[time]) / int(line["batch"]))) if line[time] else ""
+
+
+def _ratio(theirs: Line, ours: Line, time: str) -> str:
+    return _number(str(float(theirs[time]) / float(ours[time]))) if theirs[time] and ours[time] else ""
+
+
+def _table(header: list[str], rows: list[list[Any]], left: tuple[str, ...] = ()) -> list[str]:
+    join: Callable[[list[Any]], str] = lambda cells: "| " + " | ".join(map(str, cells)) + " |"  # noqa: E731
+    return [join(header), "|" + "|".join("---" if name in left else "---:" for name in header) + "|", *map(join, rows)]
