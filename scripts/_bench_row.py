@@ -72,29 +72,38 @@ def _measure(row: Row, case: Path, budget: float, told: Told) -> None:
     calls = [solver.prepare(problem) if is_loop else problem for problem in problems]
     _tell(told)
 
+    def with_graph(i: int) -> Tensor:
+        problem = calls[i % len(calls)]
+        return solver(**{**problem, "y_ini": problem["y_ini"].detach().requires_grad_()}).u
+
     def forward(i: int) -> None:
         with torch.no_grad():
             solver(**calls[i % len(calls)])
 
-    began = time.perf_counter()
-    forward(0)
+    began, note, call = time.perf_counter(), "", forward
+    try:
+        forward(0)
+    except Exception:  # some peers can be called with a graph alone
+        if not differentiable:
+            raise
+        began, note, call = time.perf_counter(), "forward is timed with a graph, without one it fails", with_graph
+        with_graph(0)
     first = time.perf_counter() - began
     told |= {"first_ms": 1e3 * first, "forward_ms": 1e3 * first, "repeats": 1, "peak_mb": _peak() - before}
     _tell(told)
     if row.scaling:
         told |= _beside(solver, layer_of(row.plant, *recording, row.horizon), calls, budget)
     else:
-        told |= _summary("forward", _repeat(forward, budget, first)[:, 0])
+        told |= _summary("forward", _repeat(call, budget, first)[:, 0])
     told["peak_mb"] = _peak() - before
     told |= _errors(solver, is_loop, row, inputs, reference, differentiable)
+    told["message"] = "; ".join(part for part in (told["message"], note) if part)
     _tell(told)
     if not differentiable:
         return
 
     def both(i: int) -> float:
-        problem = calls[i % len(calls)]
-        y_ini = problem["y_ini"].detach().requires_grad_()
-        loss = solver(**{**problem, "y_ini": y_ini}).u.sum()
+        loss = with_graph(i).sum()
         forward_done = time.perf_counter()
         loss.backward()
         return forward_done
@@ -146,7 +155,7 @@ def _warm_up_imports(row: Row) -> bool:
 # --- times -----------------------------------------------------------------------------------------------------------
 
 
-def _repeat(call: Callable[[int], float | None], budget: float, first: float) -> Array:
+def _repeat(call: Callable[[int], Any], budget: float, first: float) -> Array:
     """Return the times [ms] of the calls, `(repeats, 2)`: whole, and after the moment that the call returned."""
     least = 1 if first > LONG else LEAST_REPEATS
     i, end = 0, time.perf_counter() + min(WARM_UP, budget)
@@ -157,9 +166,9 @@ def _repeat(call: Callable[[int], float | None], budget: float, first: float) ->
     end = time.perf_counter() + budget
     while len(times) < least or (time.perf_counter() < end and len(times) < MOST_REPEATS):
         began = time.perf_counter()
-        middle = call(i) or began
+        middle = call(i)
         done = time.perf_counter()
-        times.append((1e3 * (done - began), 1e3 * (done - middle)))
+        times.append((1e3 * (done - began), 1e3 * (done - middle) if isinstance(middle, float) else np.nan))
         i += 1
     return np.array(times)
 

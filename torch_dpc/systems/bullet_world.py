@@ -1,5 +1,6 @@
 """A PyBullet server with one vehicle over flat ground: the only module that imports pybullet."""
 
+import ctypes
 import importlib
 import importlib.resources
 import os
@@ -153,6 +154,8 @@ def _silent_c_output() -> Iterator[None]:
         os.dup2(nowhere, 1)
         yield
     finally:
+        if os.name == "posix":
+            ctypes.CDLL(None).fflush(None)  # C keeps what it prints into a pipe until then
         os.dup2(kept, 1)
         os.close(kept)
         os.close(nowhere)
