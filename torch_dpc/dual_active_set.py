@@ -42,14 +42,13 @@ class Daqp:
         self._Ct = np.ascontiguousarray(Ct.detach().cpu().numpy())
         self._local = threading.local()
 
-    def solve(self, lower: np.ndarray, upper: np.ndarray, tight: np.ndarray) -> tuple[np.ndarray, int, int]:
-        """Return multipliers `(N,)`, exit flag and iterations for lower <= Ct x <= upper, equal where tight."""
+    def solve(self, lower: np.ndarray, upper: np.ndarray, sense: np.ndarray) -> tuple[np.ndarray, int, int]:
+        """Return multipliers `(N,)`, exit flag and iterations for lower <= Ct x <= upper, equal where `sense` says."""
         model = getattr(self._local, "model", None)
         if model is None:
             model = self._local.model = self._set_up()
         # `sense` drops the warm start, so that the answer does not depend on history. After a rejected update, `solve`
         # would return the answer of the problem before with a flag that says solved.
-        sense = tight * _EQUALITY
         rejected = model.update(bupper=upper, blower=lower, sense=sense)
         if rejected < 0:
             return np.zeros_like(lower), int(rejected), 0
@@ -65,6 +64,11 @@ class Daqp:
             raise RuntimeError(f"DAQP could not set up the reduced problem, exit flag {flag}.")
         model.settings = {"primal_tol": PRIMAL_TOLERANCE}
         return model
+
+
+def sense_of(tight: np.ndarray) -> np.ndarray:
+    """Return DAQP's kinds of constraints: equality where the bounds leave no choice."""
+    return tight * _EQUALITY
 
 
 def solve_daqp(
@@ -84,7 +88,7 @@ def solve_daqp(
         lo, hi = (lowers, uppers) if lower.ndim == 1 else (lowers[i], uppers[i])
         tight = lo == hi
         daqp_of_sample = workspace or Daqp(Ct if Ct.ndim == 2 else Ct[i])
-        found, flag, iterations[i] = daqp_of_sample.solve(lo - centre, hi - centre, tight)
+        found, flag, iterations[i] = daqp_of_sample.solve(lo - centre, hi - centre, sense_of(tight))
         solved[i] = flag == SOLVED_FLAG
         rows = np.flatnonzero((found != 0) | tight)
         rhs = (centre - np.where(found > 0, hi, lo))[rows]

@@ -29,7 +29,7 @@ def infeasibility_certificate(Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tens
     """
     Ct, v0, lower, upper = (x.detach().cpu() for x in (Ct, v0, lower, upper))
     scale = max(float(torch.linalg.matrix_norm(Ct, ord=2)), 1e-12) if Ct.numel() else 1.0
-    no_equality = np.zeros(len(v0), dtype=bool)
+    no_equality = np.zeros(len(v0), dtype=np.int32)
     for eps in (1e-6, 1e-9, 1e-12):
         soft = eps**0.5 * scale * torch.eye(len(v0), dtype=Ct.dtype)
         workspace = Daqp(torch.cat([Ct, soft], dim=1))

@@ -195,7 +195,10 @@ class DPCLayer(nn.Module):
                 raise ValueError(f"the batch shapes must broadcast, got {came}.") from error
             parts = [part.expand(*batch, *part.shape[-2:]) for part in parts]
         dtype = torch.promote_types(u_ini.dtype, y_ini.dtype)
-        theta = torch.cat([part.flatten(-2) for part in parts], dim=-1)
+        if max(part.ndim for part in parts) == 2:  # the same, in views that cost half
+            theta = torch.cat([part.reshape(-1) for part in parts])
+        else:
+            theta = torch.cat([part.flatten(-2) for part in parts], dim=-1)
         return (theta if theta.dtype == torch.float64 else theta.double()), dtype
 
     def _weights(self, device: torch.device) -> Weights:

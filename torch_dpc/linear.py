@@ -29,6 +29,8 @@ def flatten_batch(
         The batch shape; the matrices, `(m, n)` where they were shared and `(B, m, n)` otherwise; the vectors, `(B, n)`,
         None where they were None.
     """
+    if all(x is None or x.ndim == 1 for x in vectors) and all(m.ndim == 2 for m in matrices):  # one sample, unbatched
+        return torch.Size(()), list(matrices), [x if x is None else x[None] for x in vectors]
     shapes = [x.shape[:-2] for x in matrices] + [x.shape[:-1] for x in vectors if x is not None]
     batch = torch.broadcast_shapes(*shapes)
     flat_matrices = [m if m.ndim == 2 else m.expand(*batch, -1, -1).reshape(-1, *m.shape[-2:]) for m in matrices]

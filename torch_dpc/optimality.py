@@ -42,29 +42,29 @@ class Arithmetic:
         norm: Euclidean norm of the last dimension.
         clip: (x, lower, upper) -> the nearest point between the bounds.
         combine: (lam, rows) -> lam' rows, where most of lam is zero.
-        where: (condition, yes, no) -> one or the other, entry by entry.
+        count: how many entries of the last dimension are true.
     """
 
     array: Callable[[torch.Tensor], Any]
     norm: Callable[[Any], Any]
     clip: Callable[[Any, Any, Any], Any]
     combine: Callable[[Any, Any], Any]
-    where: Callable[[Any, Any, Any], Any]
+    count: Callable[[Any], Any]
 
 
 BATCHED = Arithmetic(
     array=lambda tensor: tensor,
     norm=lambda x: torch.linalg.vector_norm(x, dim=-1),
-    clip=lambda x, lower, upper: torch.minimum(torch.maximum(x, lower), upper),
+    clip=torch.clamp,
     combine=lambda lam, rows: _times(rows.mT, lam),
-    where=torch.where,
+    count=lambda flags: flags.sum(-1),
 )
 SINGLE = Arithmetic(
     array=lambda tensor: tensor.numpy(),
     norm=lambda x: (x @ x) ** 0.5,
     clip=lambda x, lower, upper: np.minimum(np.maximum(x, lower), upper),
     combine=lambda lam, rows: lam[held := lam.nonzero()[0]] @ rows[held],
-    where=np.where,
+    count=np.count_nonzero,
 )
 
 
@@ -98,7 +98,7 @@ class Optimality:
         rows, weights = reduction.rows, reduction.weights
         array = arithmetic.array
         self._norm, self._clip, self._combine = arithmetic.norm, arithmetic.clip, arithmetic.combine
-        self._where = arithmetic.where
+        self._count = arithmetic.count
         self._n_up, self._n_yp, self._n_u = rows.Up.shape[0], rows.Yp.shape[0], rows.Uf.shape[0]
         self._rank_W = rows.rank_W
         self._A_theta, self._A_lam = array(reduction.A_theta), array(reduction.A_lam.mT.contiguous())
@@ -120,22 +120,22 @@ class Optimality:
         """Return what the conditions say of multipliers lam; bounds are `(N,)` or one a sample."""
         a = a0 - self._combine(lam, self._A_lam)
         raw = _times(self._C, a)
-        v = self._clip(raw, lower, upper)
-        v = self._where(lam > 0, upper, self._where(lam < 0, lower, v))  # to the last bit; the residual looks at raw
-        residual = self._residual(theta, a, raw, v0, lam, lower, upper)
+        v = self._clip(raw + lam, lower, upper)  # at a solution this is raw, and a row that lam holds is on its bound
+        residual = self._residual(theta, a, raw, v, v0, lam)
         reach = WEAKLY_ACTIVE * (1 + abs(v))
         # A difference to an infinite bound is infinite, and so never within reach.
         touching = (upper - v <= reach) | (v - lower <= reach)
         tight = lower == upper  # its projection is constant, whatever the multiplier
         active = touching & ((abs(lam * self._diagonal) > reach) | tight)
-        n_active = active.sum(-1)
-        return Judged(v, residual, active, n_active, touching.sum(-1) - n_active)
+        n_active = self._count(active)
+        return Judged(v, residual, active, n_active, self._count(touching) - n_active)
 
-    def _residual(self, theta: Any, a: Any, v: Any, v0: Any, lam: Any, lower: Any, upper: Any) -> Any:
+    def _residual(self, theta: Any, a: Any, v: Any, projected: Any, v0: Any, lam: Any) -> Any:
         norm, n_u, n_up = self._norm, self._n_u, self._n_up
         u_ini, y_ini, refs = theta[..., :n_up], theta[..., n_up : n_up + self._n_yp], theta[..., n_up + self._n_yp :]
         # z - Proj_D(z - P z - q - H'w), the rows of u and y; u = Uf g and y = Yf g hold because v is C a
-        in_set = norm(v - self._clip(v + lam, lower, upper)) / (norm(v) + norm(v0) + _TINY)
+        size_v = norm(v)
+        in_set = norm(v - projected) / (size_v + norm(v0) + _TINY)
         # Up g = u_ini
         past = norm(_times(self._Up, a) - u_ini) / (norm(u_ini) + self._size_Up * norm(a) + _TINY)
         # 2 lambda_g M g + 2 lambda_s Yp'(Yp g - y_ini) + Uf'w_u + Yf'w_y, on the kernel of Up
@@ -147,7 +147,7 @@ class Optimality:
         total = of_Yp - of_y_ini + of_w
         total[..., self._rank_W :] += of_M
         terms = norm(of_Yp) + norm(of_y_ini) + norm(of_w) + norm(of_M)
-        terms = terms + self._floor * (norm(v) + norm(refs)) + self._rounding * norm(a)
+        terms = terms + self._floor * (size_v + norm(refs)) + self._rounding * norm(a)
         stationary = norm(total @ self._Z) / (terms + _TINY)
         return in_set + past + stationary
 

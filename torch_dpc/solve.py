@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from .checks import as_data, is_finite
-from .dual_active_set import SOLVED_FLAG, Daqp, solve_daqp
+from .dual_active_set import SOLVED_FLAG, Daqp, sense_of, solve_daqp
 from .errors import InfeasibleError, SolveError, Status
 from .infeasibility import infeasibility_certificate
 from .linear import flatten_batch, times
@@ -168,12 +168,12 @@ class Solver:
         """Run DAQP and judge its own multipliers, in NumPy; None if one sample does not convince."""
         if self._daqp is None:
             return None
-        tight = lower == upper
-        v, lam = np.empty((len(theta), len(lower))), np.empty((len(theta), len(lower)))
+        sense = sense_of(lower == upper)
+        v, lam = np.empty((2, len(theta), len(lower)))
         active, info = np.empty(v.shape, dtype=bool), np.empty((len(theta), 5))
         for i, sample in enumerate(theta):
             a0, v0 = self._single.unconstrained(sample)
-            lam[i], flag, iterations = self._daqp.solve(lower - v0, upper - v0, tight)
+            lam[i], flag, iterations = self._daqp.solve(lower - v0, upper - v0, sense)
             v[i], residual, active[i], n_active, n_weak = self._single.judge(sample, a0, v0, lam[i], lower, upper)
             if not (flag == SOLVED_FLAG and residual <= AS_GOOD_AS_POLISHED):  # NaN is not either
                 return None

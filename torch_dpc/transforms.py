@@ -29,7 +29,10 @@ def is_grads_batched(tensor: Tensor) -> bool:
 
 def carries_derivative(values: tuple[Any, ...]) -> bool:
     """Return whether a derivative, backward or forward, may be asked of one of the tensors among values."""
-    tensors = [value for value in values if isinstance(value, Tensor)]
-    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
-        return True
-    return any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)
+    if torch.is_grad_enabled():
+        for value in values:
+            if isinstance(value, Tensor) and value.requires_grad:
+                return True
+    if getattr(forward_ad, "_current_level", 0) < 0:  # no forward derivative is under way: spare the look at each
+        return False
+    return any(forward_ad.unpack_dual(v).tangent is not None for v in values if isinstance(v, Tensor))
