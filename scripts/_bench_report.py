@@ -30,9 +30,21 @@ def write_report(out: Path, lines: list[Line]) -> str:
     body = [*_scaling([line for line in lines if line["scaling"] == "True"]), *_all(shown)]
     (out / "benchmark.md").write_text("\n".join([*head, "", *first, "", *body]) + "\n")
     chosen = _of(shown, plant="masses", horizon="25", batch="1")
-    if any(line["gradient_error"] and line["both_ms"] for line in chosen):
-        scatter(out / "benchmark.png", chosen)
+    drawn = [line for line in chosen if line["gradient_error"] and line["both_ms"]]
+    if drawn:
+        scatter(out / "benchmark.png", drawn, [_why(line) for line in chosen if _lacks_gradient(line)])
     return "\n".join(first[2:])
+
+
+def _lacks_gradient(line: Line) -> bool:
+    from baselines import PEERS
+
+    known = PEERS.get(line["name"])
+    return not line["gradient_error"] and known is not None and known.kind == "differentiable"
+
+
+def _why(line: Line) -> str:
+    return f"{line['name']}, {line['status']}"
 
 
 def _made_with(lines: list[Line]) -> list[str]:
@@ -50,6 +62,8 @@ def _how(lines: list[Line]) -> str:
 
 def _ratios(lines: list[Line]) -> list[str]:
     """The layer with its default engine, beside the loop over DAQP and the fastest differentiable peer."""
+    if not _of(lines, name="torch_dpc"):
+        return ["(no row of torch_dpc itself)"]
     header = ["plant", "horizon", "batch", "forward", "a problem [us]", "DAQP loop", "ratio", "both", "a problem [us]"]
     header += ["gradient error", "fastest differentiable peer", "its both", "ratio", "its gradient error"]
     rows = []

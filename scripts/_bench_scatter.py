@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import textwrap
 from pathlib import Path
 from typing import Any
 
@@ -19,68 +20,84 @@ GROUPS = {
 }
 FLOOR = 1e-16  # errors below this are drawn here
 #: Where a label may stand: distances from the point in points, then directions.
-DISTANCES, DIRECTIONS = (8, 16, 28, 42, 58, 76, 96), 16
+DISTANCES, DIRECTIONS = (8, 14, 22, 32, 44, 58, 74, 92, 112), 24
+MARK = 7.0  # half the size of what a point takes [points]
 
 
-def scatter(path: Path, lines: list[dict[str, str]]) -> None:
-    """Draw the lines that have a time and a gradient error."""
+def scatter(path: Path, lines: list[dict[str, str]], missing: list[str]) -> None:
+    """Draw the lines, which have a time and a gradient error, and name the configurations that have none."""
     style()
-    figure, axes = plt.subplots(figsize=(9.6, 6.0))
+    figure, axes = plt.subplots(figsize=(9.6, 6.4))
     points = []
     for group, (marker, colour, size) in GROUPS.items():
-        chosen = [
-            line for line in lines if _group(line["name"]) == group and line["gradient_error"] and line["both_ms"]
-        ]
+        chosen = [line for line in lines if _group(line["name"]) == group]
         x = [float(line["both_ms"]) for line in chosen]
         y = [max(float(line["gradient_error"]), FLOOR) for line in chosen]
-        axes.scatter(x, y, s=size, marker=marker, color=colour, label=group, edgecolor="white", linewidth=0.6, zorder=3)
+        look = {"marker": marker, "color": colour, "edgecolor": "white", "linewidth": 0.6}
+        axes.scatter(x, y, s=size, label=group, zorder=4 if marker == "*" else 3, **look)
         points += [(*xy, _short(line["name"]), colour) for *xy, line in zip(x, y, chosen, strict=True)]
     axes.set(xscale="log", yscale="log", xlabel="forward + backward, one problem [ms]")
     axes.set_ylabel("relative error of the gradient")
     axes.set_title("Oscillating masses, horizon 25: time and gradient error (lower left is better)")
-    axes.margins(x=0.14, y=0.12)
-    axes.legend(loc="lower right")
+    axes.margins(x=0.17, y=0.14)
+    axes.set_xlim(right=10 * max(point[0] for point in points))  # names are longest on the right
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    if missing:
+        note = textwrap.fill("Without a gradient in time: " + ", ".join(missing) + ".", 150)
+        figure.supxlabel(note, fontsize=7.5, color="#444444")
     figure.canvas.draw()
+    figure.set_layout_engine("none")  # labels are placed in pixels: nothing may move any more
     label(figure, axes, points)
     figure.savefig(path)
     plt.close(figure)
 
 
 def label(figure: Any, axes: Any, points: list[tuple[float, float, str, str]]) -> None:
-    """Write a name at each point (x, y, name, colour), the first place that is free, with a line if it is far."""
-    renderer = figure.canvas.get_renderer()
-    scale = figure.dpi / 72
+    """Write a name at each point (x, y, name, colour), at the nearest place that is free, with a line to the point."""
+    renderer, scale = figure.canvas.get_renderer(), figure.dpi / 72
     at = axes.transData.transform([point[:2] for point in points])
-    marks = [np.array([x - 6, y - 6, x + 6, y + 6]) for x, y in at]
-    taken = [axes.get_legend().get_window_extent(renderer).extents, *marks]
+    taken = [np.array([*(centre - scale * MARK), *(centre + scale * MARK)]) for centre in at]
     frame = axes.get_window_extent(renderer).extents
-    angles = 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS
-    for (x, y, name, colour), centre in zip(points, at, strict=True):
-        text = axes.annotate(name, (x, y), (0, 0), textcoords="offset points", fontsize=8.5, color="black", zorder=4)
-        width, height = text.get_window_extent(renderer).size
+    # Points with near neighbours first: they have the fewest places.
+    crowd = [(np.linalg.norm((at - centre) / scale, axis=1) < 60).sum() for centre in at]
+    for i in np.argsort(crowd)[::-1]:
+        x, y, name, colour = points[i]
+        text = axes.annotate(name, (x, y), (0, 0), textcoords="offset points", fontsize=8.5, zorder=5)
+        size = np.array(text.get_window_extent(renderer).size)
+        others = [box for k, box in enumerate(taken) if k != i]
         places = []
         for distance in DISTANCES:
-            for angle in angles:
-                middle = centre + scale * distance * np.array([np.cos(angle), np.sin(angle)])
-                middle[0] += np.cos(angle) * width / 2
-                middle[1] += np.sin(angle) * height / 2
-                box = np.concatenate([middle - (width / 2, height / 2), middle + (width / 2, height / 2)])
-                places.append((_overlap(box, taken, frame), distance, box))
-        cost, distance, box = min(places, key=lambda place: place[:2])
-        taken.append(box + (-2, -2, 2, 2))
-        text.set_position(tuple((box[:2] - centre) / scale))
-        if distance > DISTANCES[0]:
-            end = np.clip(centre, box[:2], box[2:])
-            line = axes.transData.inverted().transform([centre, end])
-            axes.plot(*line.T, color=colour, linewidth=0.7, zorder=2)
+            for angle in 2 * np.pi * np.arange(DIRECTIONS) / DIRECTIONS:
+                towards = np.array([np.cos(angle), np.sin(angle)])
+                middle = at[i] + scale * distance * towards + towards * size / 2
+                box = np.concatenate([middle - size / 2, middle + size / 2])
+                wire = _wire(at[i], box)
+                hidden = _overlap(box, taken, frame) + 4 * sum(_overlap(bit, others, frame) for bit in wire)
+                places.append((hidden + scale * distance, distance, box, wire))
+        _, distance, box, wire = min(places, key=lambda place: place[:2])
+        taken += [box + scale * np.array([-2, -1, 2, 1]), *wire]
+        text.set_position(tuple((box[:2] - at[i]) / scale))
+        if distance > DISTANCES[0] or crowd[i] > 1:
+            ends = [at[i], np.clip(at[i], box[:2], box[2:])]
+            axes.plot(*axes.transData.inverted().transform(ends).T, color=colour, linewidth=0.8, zorder=2)
+
+
+def _wire(centre: Array, box: Array) -> list[Array]:
+    """Return small boxes along the line from a point to its label."""
+    end = np.clip(centre, box[:2], box[2:])
+    bits = [p for p in np.linspace(centre, end, 24)[:-1] if np.linalg.norm(p - centre) > 2 * MARK]
+    return [np.array([*(p - 1), *(p + 1)]) for p in bits]
 
 
 def _overlap(box: Array, taken: list[Array], frame: Array) -> float:
     """Return the area of a box (left, bottom, right, top) that is on others or outside the frame."""
-    others = np.array(taken)
-    size = np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2])
     inside = (np.minimum(box[2:], frame[2:]) - np.maximum(box[:2], frame[:2])).clip(min=0).prod()
-    return float(size.clip(min=0).prod(axis=1).sum() + (box[2:] - box[:2]).prod() - inside)
+    outside = float((box[2:] - box[:2]).prod() - inside)
+    if not taken:
+        return outside
+    others = np.array(taken)
+    shared = np.minimum(box[2:], others[:, 2:]) - np.maximum(box[:2], others[:, :2])
+    return float(shared.clip(min=0).prod(axis=1).sum()) + outside
 
 
 def _group(name: str) -> str:
@@ -89,5 +106,5 @@ def _group(name: str) -> str:
 
 
 def _short(name: str) -> str:
-    """Leave out what the colour says."""
-    return name.removesuffix(" (reduced)").removesuffix(" (paper)")
+    """Leave out what the colour says, and DIFFCP, which the name of its solver implies."""
+    return name.removesuffix(" (reduced)").removesuffix(" (paper)").replace("cvxpylayers DIFFCP", "cvxpylayers")

@@ -159,7 +159,8 @@ def _key(line: Line) -> tuple[str, ...]:
 
 def _is_done(line: Line | None, stamp: Line) -> bool:
     """A line counts if what it was made with is the same; a full one counts for a quick run too."""
-    same = line is not None and all(line[name] == str(stamp[name]) for name in stamp if name != "mode")
+    same = line is not None and line["status"] not in ("not run", "no problem")
+    same = same and all(line[name] == str(stamp[name]) for name in stamp if name != "mode")
     return same and line["mode"] in (stamp["mode"], "full")
 
 
@@ -169,7 +170,8 @@ def _stamp(row: Row, mode: str, threads: int) -> Line:
     made_of = folders["ours" if row.name in OURS else "loop" if row.name == LOOP else "peers"]
     files = [path for folder in made_of for path in sorted((ROOT / folder).rglob("*.py"))]
     files += [
-        ROOT / "scripts" / name for name in ("_bench_row.py", "_bench_cases.py", "_daqp_loop.py", "_reference.py")
+        ROOT / "scripts" / name
+        for name in ("_bench_row.py", "_bench_timing.py", "_bench_cases.py", "_daqp_loop.py", "_reference.py")
     ]
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:8]
     return {

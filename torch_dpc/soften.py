@@ -18,7 +18,7 @@ from .solution import DPCSolution
 
 #: Widths tried at once, and rounds of narrowing: t is found to (SECTIONS - 1)^-ROUNDS of its scale.
 SECTIONS = 16
-ROUNDS = 8
+ROUNDS = 12
 
 
 def plan_softened(layer: DPCLayer, theta: Tensor, weight: float) -> tuple[DPCSolution, float]:
