@@ -1,6 +1,6 @@
 """Benchmark: time and error of torch_dpc beside other solvers and differentiable QP layers.
 
-    python scripts/benchmark.py             # about TODO minutes on two cores
+    python scripts/benchmark.py             # about 30 minutes on two cores
     python scripts/benchmark.py --quick     # under 2 minutes: the masses at horizon 25, the fastest peers
     python scripts/benchmark.py --scaling   # the number of recorded windows, 500 to 50,000, alone
 

@@ -15,8 +15,9 @@ from torch import Tensor
 
 from .linear import times
 
-#: Below this ratio of the extreme pivots a Cholesky factor of G[A, A] is not trusted.
-PIVOT_RATIO = 1e-5
+#: A Cholesky factor of G[A, A] is trusted where every row of Ct stands out of the span of those before it by this
+#: fraction of its length; G cannot tell less.
+STANDING_OUT = 1e-5
 #: Rows of Ct that stand out of the span of the others by less than this fraction of their length are dependent.
 DEPENDENT_ROW = 1e-9
 #: Samples of like size that share one padded factorisation on the CPU.
@@ -103,9 +104,9 @@ def solve_rows(G: np.ndarray, rows: np.ndarray, rhs: np.ndarray) -> np.ndarray |
     if len(rows) == 0:
         return rhs
     # LAPACK itself: the wrappers of NumPy and torch cost several times a system of this size.
-    factor, solution, failed = dposv(G[rows[:, None], rows], rhs)
-    pivots = factor.diagonal()
-    if failed or not pivots.min() > PIVOT_RATIO * pivots.max():
+    block = G[rows[:, None], rows]
+    factor, solution, failed = dposv(block, rhs)
+    if failed or not (factor.diagonal() > STANDING_OUT * block.diagonal() ** 0.5).all():
         return None
     return solution
 
@@ -128,10 +129,15 @@ def _packed_group(
 ) -> tuple[Tensor, Tensor]:
     n = rhs.shape[1]
     index = _pack(active, count)
-    L, info = torch.linalg.cholesky_ex(_blocks(table, index, samples))
+    block = _blocks(table, index, samples)
+    L, info = torch.linalg.cholesky_ex(block)
     x = torch.cholesky_solve(rhs.gather(1, index.clamp_max(n - 1))[..., None], L)[..., 0]
     lam = x.new_zeros(len(rhs), 2 * n).scatter_(1, index, x)[:, :n]
-    return lam, (info == 0) & _pivots_are_clear(L, index < n)
+    if L.shape[-1] == 0:
+        return lam, info == 0
+    # What of a row stands out of the span of those before it, as a fraction of its length: free of units.
+    standing = L.diagonal(dim1=-2, dim2=-1) / block.diagonal(dim1=-2, dim2=-1).sqrt()
+    return lam, (info == 0) & (standing.amin(-1) > STANDING_OUT)
 
 
 def _identity_padded(G: Tensor) -> Tensor:
@@ -161,16 +167,6 @@ def _blocks(table: Tensor, index: Tensor, samples: Tensor | None) -> Tensor:
     if table.ndim == 3 and samples is not None:
         flat = flat + samples[:, None, None] * width * width
     return table.reshape(-1).index_select(0, flat.reshape(-1)).reshape(flat.shape)
-
-
-def _pivots_are_clear(L: Tensor, real: Tensor) -> Tensor:
-    """Return which factors have no pivot that rounding alone could have made."""
-    if L.shape[-1] == 0:
-        return torch.ones(len(L), dtype=torch.bool, device=L.device)
-    pivots = L.diagonal(dim1=-2, dim2=-1)
-    largest = torch.where(real, pivots, 0.0).amax(-1)
-    smallest = torch.where(real, pivots, torch.inf).amin(-1)
-    return smallest > PIVOT_RATIO * largest
 
 
 def _independent_rows(Ct: Tensor, rows: Tensor) -> tuple[Tensor, Tensor]:
