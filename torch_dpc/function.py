@@ -26,20 +26,20 @@ from .errors import Status
 from .linear import flatten_batch, lead_all, outer, times
 from .projected_kkt import FullAdjoint
 from .reduction import Reduction
-from .solve import Solved, Solver
+from .solve import Planned, Solver
 from .transforms import carries_derivative, is_grads_batched, is_plain
 
 
-def solve_reduced(solver: Solver, theta: Tensor, reduction: Reduction, lower: Tensor, upper: Tensor) -> Solved:
+def solve_reduced(solver: Solver, theta: Tensor, reduction: Reduction, lower: Tensor, upper: Tensor) -> Planned:
     """Solve for every theta `(*batch, n_theta)`; differentiable in theta, the reduction and the bounds."""
     inputs = (theta, reduction.A_theta, reduction.rows.C, reduction.G, reduction.Ct, lower, upper)
     if not carries_derivative(inputs) and is_plain(theta):  # a third of the time of a small call is the Function's
         return solver.solve(theta, lower, upper)
-    return Solved(*SolveReduced.apply(*inputs, solver))
+    return Planned(*SolveReduced.apply(*inputs, solver))
 
 
 class SolveReduced(torch.autograd.Function):
-    """(theta, A, C, G, Ct, lower, upper) -> v, lam, active, info, as `Solved` describes them."""
+    """(theta, A, C, G, Ct, lower, upper) -> u, y, lam, active, info, as `Planned` describes them."""
 
     @staticmethod
     def forward(
@@ -57,22 +57,23 @@ class SolveReduced(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
         theta, A, C, G, Ct, lower, upper, solver = inputs
-        _, lam, active, info = output
+        _, _, lam, active, info = output
         ctx.mark_non_differentiable(active, info)
         ctx.set_materialize_grads(False)
-        ctx.full = solver.full
+        ctx.full, ctx.sizes = solver.full, solver.sizes
         ctx.may_fail = solver.on_failure != "raise"
         saved = (theta, A, C, G, Ct, lower, upper, lam, active, info)
         ctx.save_for_backward(*saved)
         ctx.save_for_forward(*saved)
 
     @staticmethod
-    def backward(ctx: Any, v_bar: Tensor | None, lam_bar: Tensor | None, *_: Any) -> tuple[Tensor | None, ...]:
+    def backward(
+        ctx: Any, u_bar: Tensor | None, y_bar: Tensor | None, lam_bar: Tensor | None, *_: Any
+    ) -> tuple[Tensor | None, ...]:
         theta, A, C, G, Ct, lower, upper, lam, active, info = ctx.saved_tensors
-        if v_bar is None:
-            if lam_bar is None:
-                return (None,) * 8
-            v_bar = torch.zeros_like(lam)
+        if u_bar is None and y_bar is None and lam_bar is None:
+            return (None,) * 8
+        v_bar = ctx.sizes.join(u_bar, y_bar, lam)
         if ctx.may_fail:  # samples without a solution add nothing, whatever came back for their NaN
             solved = info[..., :1] == Status.SOLVED
             v_bar = torch.where(solved, v_bar, 0.0)
@@ -127,7 +128,8 @@ class SolveReduced(torch.autograd.Function):
         if upper_t is not None:
             rhs = rhs - torch.where(lam < 0, 0.0, upper_t)
         lam_t = SolveActive.apply(rhs * solved, active, G, Ct)
-        return (torch.where(solved, free - times(G, lam_t), 0.0), lam_t, None, None)
+        v_t = torch.where(solved, free - times(G, lam_t), 0.0)
+        return *ctx.sizes.split(v_t), lam_t, None, None
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:

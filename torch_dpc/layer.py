@@ -145,9 +145,7 @@ class DPCLayer(nn.Module):
         if on_failure is not None and on_failure != solver.on_failure:
             _check_choice("on_failure", on_failure, ("raise", "nan"))
             solver = solver.with_failures(on_failure)
-        v, lam, _, info = solve_reduced(solver, theta, reduction, lower, upper)
-        u, y = v.split((self.sizes.u, self.sizes.y), dim=-1)
-        u, y = (x.reshape(*x.shape[:-1], self.data.horizon, n) for x, n in ((u, self.data.n_u), (y, self.data.n_y)))
+        u, y, lam, _, info = solve_reduced(solver, theta, reduction, lower, upper)
         return DPCSolution(
             u=u if dtype == torch.float64 else u.to(dtype),
             y=y if dtype == torch.float64 else y.to(dtype),
@@ -185,20 +183,11 @@ class DPCLayer(nn.Module):
             _reference("u_ref", u_ref, data.horizon, data.n_u, "n_u", u_ini),
             _reference("y_ref", y_ref, data.horizon, data.n_y, "n_y", y_ini),
         ]
-        shapes = [part.shape[:-2] for part in parts]
-        if any(shape != shapes[0] for shape in shapes):
-            try:
-                batch = torch.broadcast_shapes(*shapes)
-            except RuntimeError as error:
-                names = ("u_ini", "y_ini", "u_ref", "y_ref")
-                came = ", ".join(f"{name} {tuple(shape)}" for name, shape in zip(names, shapes, strict=True))
-                raise ValueError(f"the batch shapes must broadcast, got {came}.") from error
-            parts = [part.expand(*batch, *part.shape[-2:]) for part in parts]
-        dtype = torch.promote_types(u_ini.dtype, y_ini.dtype)
-        if max(part.ndim for part in parts) == 2:  # the same, in views that cost half
+        dtype = u_ini.dtype if u_ini.dtype == y_ini.dtype else torch.promote_types(u_ini.dtype, y_ini.dtype)
+        if all(part.ndim == 2 for part in parts):
             theta = torch.cat([part.reshape(-1) for part in parts])
         else:
-            theta = torch.cat([part.flatten(-2) for part in parts], dim=-1)
+            theta = torch.cat([part.flatten(-2) for part in _with_one_batch(parts)], dim=-1)
         return (theta if theta.dtype == torch.float64 else theta.double()), dtype
 
     def _weights(self, device: torch.device) -> Weights:
@@ -269,6 +258,19 @@ def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
         raise ValueError(f"`{name}` must be one of {', '.join(map(repr, choices))}, got {value!r}.")
 
 
+def _with_one_batch(parts: list[Tensor]) -> list[Tensor]:
+    shapes = [part.shape[:-2] for part in parts]
+    if all(shape == shapes[0] for shape in shapes):
+        return parts
+    try:
+        batch = torch.broadcast_shapes(*shapes)
+    except RuntimeError as error:
+        names = ("u_ini", "y_ini", "u_ref", "y_ref")
+        came = ", ".join(f"{name} {tuple(shape)}" for name, shape in zip(names, shapes, strict=True))
+        raise ValueError(f"the batch shapes must broadcast, got {came}.") from error
+    return [part.expand(*batch, *part.shape[-2:]) for part in parts]
+
+
 def _as_box(name: str, value: Any) -> Box:
     if value is None:
         return Reals()
@@ -303,5 +305,7 @@ def _reference(name: str, value: Any, steps: int, channels: int, symbol: str, li
 def _is_same(kept: Any, now: Any) -> bool:
     """Compare values: version counters would be cheaper, but miss edits through `.data`."""
     if isinstance(kept, Tensor) and isinstance(now, Tensor):
-        return kept.shape == now.shape and kept.dtype == now.dtype and torch.equal(kept.to(now.device), now)
+        if kept.device != now.device:
+            kept = kept.to(now.device)
+        return kept.dtype == now.dtype and torch.equal(kept, now)
     return kept is now or (isinstance(kept, (int, float, str)) and isinstance(now, (int, float, str)) and kept == now)

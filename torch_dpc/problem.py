@@ -122,23 +122,40 @@ def stacked_bounds(u_set: Box, y_set: Box, data: HankelData, device: torch.devic
 
 @dataclass(frozen=True)
 class Sizes:
-    """How many entries each part of theta = (u_ini, y_ini, u_ref, y_ref) and of v = (u, y) has."""
+    """How many entries each part of theta = (u_ini, y_ini, u_ref, y_ref) and of v = (u, y) has, and how many steps."""
 
     u_ini: int
     y_ini: int
     u: int
     y: int
+    horizon: int
 
     @staticmethod
     def of(data: HankelData) -> Sizes:
         """Read the sizes off the data."""
         past, future = data.t_ini, data.horizon
-        return Sizes(past * data.n_u, past * data.n_y, future * data.n_u, future * data.n_y)
+        return Sizes(past * data.n_u, past * data.n_y, future * data.n_u, future * data.n_y, future)
 
     @property
     def theta(self) -> tuple[int, int, int, int]:
         """The sizes of the four parts of theta."""
         return self.u_ini, self.y_ini, self.u, self.y
+
+    def split(self, v: Any) -> tuple[Any, Any]:
+        """Return u `(..., horizon, n_u)` and y `(..., horizon, n_y)` of v, a tensor or an array `(..., N)`."""
+        batch = v.shape[:-1]
+        u, y = v[..., : self.u], v[..., self.u :]
+        return (
+            u.reshape((*batch, self.horizon, self.u // self.horizon)),
+            y.reshape((*batch, self.horizon, self.y // self.horizon)),
+        )
+
+    def join(self, u: Tensor | None, y: Tensor | None, like: Tensor) -> Tensor:
+        """Return v `(*batch, N)` of u and y, `(*batch, horizon, n)`, zero where they are None and shaped as `like`."""
+        batch = like.shape[:-1]
+        u = like.new_zeros(*batch, self.u) if u is None else u.reshape((*batch, self.u))
+        y = like.new_zeros(*batch, self.y) if y is None else y.reshape((*batch, self.y))
+        return torch.cat([u, y], dim=-1)
 
 
 def projector(data: HankelData) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -55,6 +56,16 @@ class Solved(NamedTuple):
         return self.info[..., 0] != Status.SOLVED
 
 
+class Planned(NamedTuple):
+    """The solution as the layer hands it out: `Solved`, with u `(*batch, horizon, n_u)` and y for v."""
+
+    u: Tensor
+    y: Tensor
+    lam: Tensor
+    active: Tensor
+    info: Tensor
+
+
 @dataclass(frozen=True, eq=False)
 class Solver:
     """Everything a solve needs besides its tensors.
@@ -91,7 +102,7 @@ class Solver:
         other.__dict__.update({k: v for k, v in self.__dict__.items() if k not in ("on_failure",)})
         return other
 
-    def solve(self, theta: Tensor, lower: Tensor, upper: Tensor) -> Solved:
+    def solve(self, theta: Tensor, lower: Tensor, upper: Tensor) -> Planned:
         """Solve for every theta.
 
         Args:
@@ -116,7 +127,8 @@ class Solver:
         one_each = self if self.reduction.G.ndim == 2 else replace(self, reduction=self.reduction.of_batch(batch))
         solved = one_each._solve(samples, lower, upper, daqp_first)
         self._report(solved, batch)
-        return Solved(*(x.reshape(*batch, x.shape[-1]) for x in solved))
+        v, *rest = (x.reshape(*batch, x.shape[-1]) for x in solved)
+        return Planned(*self.sizes.split(v), *rest)
 
     def _solve(self, theta: Tensor, lower: Tensor, upper: Tensor, daqp_first: bool) -> Solved:
         """Run the first engine on the batch, the second on what it left."""
@@ -148,7 +160,7 @@ class Solver:
         """Whether NumPy can take the samples one by one: few, on the CPU, and nothing to look at sample by sample."""
         shared = lower.ndim == upper.ndim == 1 and self.reduction.rows.u_ini_range is None
         few = theta.numel() <= FEW * theta.shape[-1] and theta.device.type == "cpu"
-        return shared and few and bool(np.isfinite(theta.numpy()).all())
+        return shared and few and math.isfinite(theta.numpy().sum())
 
     def _engine(self, daqp: bool) -> Engine:
         return partial(solve_daqp, workspace=self._daqp) if daqp else solve_newton
@@ -164,7 +176,7 @@ class Solver:
 
     def _one_by_one(
         self, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray, batch: tuple[int, ...]
-    ) -> Solved | None:
+    ) -> Planned | None:
         """Run DAQP and judge its own multipliers, in NumPy; None if one sample does not convince."""
         if self._daqp is None:
             return None
@@ -178,7 +190,9 @@ class Solver:
             if not (flag == SOLVED_FLAG and residual <= AS_GOOD_AS_POLISHED):  # NaN is not either
                 return None
             info[i] = Status.SOLVED, iterations, residual, n_active, n_weak
-        return Solved(*(torch.from_numpy(x.reshape(*batch, x.shape[-1])) for x in (v, lam, active, info)))
+        v, lam, active, info = (x.reshape((*batch, x.shape[-1])) for x in (v, lam, active, info))
+        u, y = self.sizes.split(v)
+        return Planned(*(torch.from_numpy(x) for x in (u, y, lam, active, info)))
 
     def _mark_failures(self, solved: Solved, rest: Tensor, theta: Tensor, lower: Tensor, upper: Tensor) -> None:
         """Look for certificates where both engines failed; leave NaN for v and nothing in the multipliers."""
