@@ -154,7 +154,7 @@ def _spread(line: Line, stage: str) -> str:
     if not line[f"{stage}_ms"]:
         return ""
     low, high = _number(line[f"{stage}_q1"]), _number(line[f"{stage}_q3"])
-    return _number(line[f"{stage}_ms"]) + (f" ({low} to {high})" if low else "")
+    return _number(line[f"{stage}_ms"]) + (f" ({low} to {high})" if low != high else "")
 
 
 def _each(line: Line, time: str) -> str:

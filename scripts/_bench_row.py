@@ -148,7 +148,7 @@ def _measure(row: Row, case: Path, budget: float, told: Told) -> None:
         told |= summary("both", repeated[:, 0]) | summary("backward", repeated[:, 1]) | {"peak_mb": peak() - before}
         _tell(told)
     set_ups = [solver.setup_ms]
-    while solver.setup_ms < 1e3 * QUICK_SET_UP and len(set_ups) < SET_UPS:
+    while least_repeats(first) > 1 and solver.setup_ms < 1e3 * QUICK_SET_UP and len(set_ups) < SET_UPS:
         set_ups.append(Solver(row, of_n_g).setup_ms)
     told["setup_ms"] = np.median(set_ups)
 

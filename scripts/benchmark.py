@@ -133,16 +133,18 @@ def in_a_process(order: Line, limit: float) -> Line:
 
 
 def read_lines(path: Path) -> list[Line]:
-    """Return the lines of benchmark.csv as strings; none where the file is not there or has other columns."""
+    """Return the latest line of each row as strings; none where the file is not there or has other columns."""
     if not path.exists():
         return []
     with path.open(newline="") as file:
         reader = csv.DictReader(file)
-        return [line for line in reader if None not in line.values()] if reader.fieldnames == FIELDS else []
+        if reader.fieldnames != FIELDS:
+            return []
+        return list({_key(line): line for line in reader if None not in line.values()}.values())
 
 
 def _rewrite(path: Path, lines: Iterable[Line]) -> None:
-    """Write the file anew, the latest line of each row."""
+    """Write the file anew."""
     with path.open("w", newline="") as file:
         writer = csv.DictWriter(file, FIELDS)
         writer.writeheader()

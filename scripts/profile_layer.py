@@ -26,6 +26,7 @@ import torch_dpc as dpc
 from _bench_cases import CYCLE, N_G, T_INI, inputs_of, layer_of, record, take
 from _common import RESULTS, cores, versions
 from torch_dpc.active_set import adjoint
+from torch_dpc.dual_active_set import sense_of
 from torch_dpc.newton import solve_newton
 
 PLANT, HORIZON, BATCHES = "masses", 25, (1, 1024)
@@ -80,10 +81,10 @@ def stages_of(layer: dpc.DPCLayer, problems: list[Problem]) -> tuple[Stages, Sta
 
     def find(start: Any) -> Any:
         if one:
-            return solver._daqp.solve(lo - start[1], up - start[1], lo == up)
+            return solver._daqp.solve(lo - start[1], up - start[1], sense_of(lo == up))
         return solve_newton(reduction.G, reduction.Ct, start[1], lower, upper)
 
-    bars, N = [torch.ones_like(found.v) for found in solved], len(lower)
+    bars, N = [torch.ones_like(found.lam) for found in solved], len(lower)
     flat = [(found.active.reshape(-1, N), bar.reshape(-1, N)) for found, bar in zip(solved, bars, strict=True)]
     A, C, n = reduction.A_theta, reduction.rows.C, len(problems)
     around = {
