@@ -178,21 +178,34 @@ class Solver:
         self, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray, batch: tuple[int, ...]
     ) -> Planned | None:
         """Run DAQP and judge its own multipliers, in NumPy; None if one sample does not convince."""
+        sense = sense_of(lower == upper)
+        found = []
+        for sample in theta:
+            one = self._one(sample, lower, upper, sense)
+            if one is None:
+                return None
+            found.append(one)
+        if not batch:
+            v, *rest = found[0]
+        elif found:
+            v, *rest = (np.stack(x).reshape((*batch, -1)) for x in zip(*found, strict=True))
+        else:
+            return None
+        u, y = self.sizes.split(v)
+        return Planned(*map(torch.from_numpy, (u, y, *rest)))
+
+    def _one(
+        self, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray, sense: np.ndarray
+    ) -> tuple[np.ndarray, ...] | None:
+        """Return v, lam, active and info of one sample, as `Solved` describes them."""
         if self._daqp is None:
             return None
-        sense = sense_of(lower == upper)
-        v, lam = np.empty((2, len(theta), len(lower)))
-        active, info = np.empty(v.shape, dtype=bool), np.empty((len(theta), 5))
-        for i, sample in enumerate(theta):
-            a0, v0 = self._single.unconstrained(sample)
-            lam[i], flag, iterations = self._daqp.solve(lower - v0, upper - v0, sense)
-            v[i], residual, active[i], n_active, n_weak = self._single.judge(sample, a0, v0, lam[i], lower, upper)
-            if not (flag == SOLVED_FLAG and residual <= AS_GOOD_AS_POLISHED):  # NaN is not either
-                return None
-            info[i] = Status.SOLVED, iterations, residual, n_active, n_weak
-        v, lam, active, info = (x.reshape((*batch, x.shape[-1])) for x in (v, lam, active, info))
-        u, y = self.sizes.split(v)
-        return Planned(*(torch.from_numpy(x) for x in (u, y, lam, active, info)))
+        a0, v0 = self._single.unconstrained(theta)
+        lam, flag, iterations = self._daqp.solve(lower - v0, upper - v0, sense)
+        v, residual, active, n_active, n_weak = self._single.judge(theta, a0, v0, lam, lower, upper)
+        if not (flag == SOLVED_FLAG and residual <= AS_GOOD_AS_POLISHED):  # NaN is not either
+            return None
+        return v, lam, active, np.array((Status.SOLVED, iterations, residual, n_active, n_weak), dtype=np.float64)
 
     def _mark_failures(self, solved: Solved, rest: Tensor, theta: Tensor, lower: Tensor, upper: Tensor) -> None:
         """Look for certificates where both engines failed; leave NaN for v and nothing in the multipliers."""
