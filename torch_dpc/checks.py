@@ -47,3 +47,42 @@ def check_count(name: str, value: Any) -> None:
     """Raise ValueError unless the value is a positive integer."""
     if not isinstance(value, int) or isinstance(value, bool) or value < 1:
         raise ValueError(f"`{name}` must be a positive integer, got {value!r}.")
+
+
+def window(name: str, value: Any, steps: int, channels: int, symbol: str) -> Tensor:
+    """Return a past window as a tensor `(*batch, steps, channels)`; `symbol` is what messages call the channels."""
+    tensor = as_data(name, value, finite=False)  # values are looked at inside the Function: here it would break vmap
+    if tensor.shape[-2:] != (steps, channels):
+        raise ValueError(
+            f"`{name}` must have shape (*batch, t_ini, {symbol}) = (*, {steps}, {channels}), "
+            f"got {tuple(tensor.shape)}."
+        )
+    return tensor
+
+
+def reference(name: str, value: Any, steps: int, channels: int, symbol: str, like: Tensor) -> Tensor:
+    """Return a reference as a tensor `(*batch, steps, channels)`, on the device of `like`; zero for None."""
+    if value is None:
+        return like.new_zeros(()).expand(steps, channels)
+    tensor = as_data(name, value, finite=False).to(like.device)
+    try:
+        return tensor.expand(*tensor.shape[:-2], steps, channels)
+    except RuntimeError as error:
+        raise ValueError(
+            f"`{name}` must broadcast to (*batch, horizon, {symbol}) = (*, {steps}, {channels}), "
+            f"got {tuple(tensor.shape)}."
+        ) from error
+
+
+def with_one_batch(parts: list[Tensor]) -> list[Tensor]:
+    """Return u_ini, y_ini, u_ref and y_ref, `(*batch, steps, n)`, with one batch shape."""
+    shapes = [part.shape[:-2] for part in parts]
+    if all(shape == shapes[0] for shape in shapes):
+        return parts
+    try:
+        batch = torch.broadcast_shapes(*shapes)
+    except RuntimeError as error:
+        names = ("u_ini", "y_ini", "u_ref", "y_ref")
+        came = ", ".join(f"{name} {tuple(shape)}" for name, shape in zip(names, shapes, strict=True))
+        raise ValueError(f"the batch shapes must broadcast, got {came}.") from error
+    return [part.expand(*batch, *part.shape[-2:]) for part in parts]

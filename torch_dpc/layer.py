@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from .checks import as_data
+from .checks import reference, window, with_one_batch
 from .errors import Status
 from .function import solve_reduced
 from .hankel import HankelData
@@ -175,19 +175,19 @@ class DPCLayer(nn.Module):
     def flatten(self, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any) -> tuple[Tensor, torch.dtype]:
         """Return (u_ini, y_ini, u_ref, y_ref) flattened, `(*batch, n_theta)` in float64, and the caller's dtype."""
         data = self.data
-        u_ini = _window("u_ini", u_ini, data.t_ini, data.n_u, "n_u")
-        y_ini = _window("y_ini", y_ini, data.t_ini, data.n_y, "n_y")
+        u_ini = window("u_ini", u_ini, data.t_ini, data.n_u, "n_u")
+        y_ini = window("y_ini", y_ini, data.t_ini, data.n_y, "n_y")
         parts = [
             u_ini,
             y_ini,
-            _reference("u_ref", u_ref, data.horizon, data.n_u, "n_u", u_ini),
-            _reference("y_ref", y_ref, data.horizon, data.n_y, "n_y", y_ini),
+            reference("u_ref", u_ref, data.horizon, data.n_u, "n_u", u_ini),
+            reference("y_ref", y_ref, data.horizon, data.n_y, "n_y", y_ini),
         ]
         dtype = u_ini.dtype if u_ini.dtype == y_ini.dtype else torch.promote_types(u_ini.dtype, y_ini.dtype)
         if all(part.ndim == 2 for part in parts):
             theta = torch.cat([part.reshape(-1) for part in parts])
         else:
-            theta = torch.cat([part.flatten(-2) for part in _with_one_batch(parts)], dim=-1)
+            theta = torch.cat([part.flatten(-2) for part in with_one_batch(parts)], dim=-1)
         return (theta if theta.dtype == torch.float64 else theta.double()), dtype
 
     def _weights(self, device: torch.device) -> Weights:
@@ -258,48 +258,12 @@ def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
         raise ValueError(f"`{name}` must be one of {', '.join(map(repr, choices))}, got {value!r}.")
 
 
-def _with_one_batch(parts: list[Tensor]) -> list[Tensor]:
-    shapes = [part.shape[:-2] for part in parts]
-    if all(shape == shapes[0] for shape in shapes):
-        return parts
-    try:
-        batch = torch.broadcast_shapes(*shapes)
-    except RuntimeError as error:
-        names = ("u_ini", "y_ini", "u_ref", "y_ref")
-        came = ", ".join(f"{name} {tuple(shape)}" for name, shape in zip(names, shapes, strict=True))
-        raise ValueError(f"the batch shapes must broadcast, got {came}.") from error
-    return [part.expand(*batch, *part.shape[-2:]) for part in parts]
-
-
 def _as_box(name: str, value: Any) -> Box:
     if value is None:
         return Reals()
     if not isinstance(value, Box):
         raise ValueError(f"`{name}` must be a Box, Reals or None, got {type(value).__name__}.")
     return value
-
-
-def _window(name: str, value: Any, steps: int, channels: int, symbol: str) -> Tensor:
-    tensor = as_data(name, value, finite=False)  # values are looked at inside the Function: here it would break vmap
-    if tensor.shape[-2:] != (steps, channels):
-        raise ValueError(
-            f"`{name}` must have shape (*batch, t_ini, {symbol}) = (*, {steps}, {channels}), "
-            f"got {tuple(tensor.shape)}."
-        )
-    return tensor
-
-
-def _reference(name: str, value: Any, steps: int, channels: int, symbol: str, like: Tensor) -> Tensor:
-    if value is None:
-        return like.new_zeros(()).expand(steps, channels)
-    tensor = as_data(name, value, finite=False).to(like.device)
-    try:
-        return tensor.expand(*tensor.shape[:-2], steps, channels)
-    except RuntimeError as error:
-        raise ValueError(
-            f"`{name}` must broadcast to (*batch, horizon, {symbol}) = (*, {steps}, {channels}), "
-            f"got {tuple(tensor.shape)}."
-        ) from error
 
 
 def _is_same(kept: Any, now: Any) -> bool:
