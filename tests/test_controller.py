@@ -238,3 +238,22 @@ def test_bad_runs_are_named(change, says):
     controller = dpc.DPCController(small_layer(), 3)
     with pytest.raises(ValueError, match=says):
         dpc.simulate(**{"plant": Recorder(), "controller": controller, "y_ref": Y_REF, "steps": 5, **change})
+
+
+def test_a_plant_that_cannot_measure_makes_one_step_to_learn_its_output():
+    class Bare:
+        """Nothing but what a plant has to offer."""
+
+        n_u, n_y, dt = 2, 4, 0.1
+
+        def __init__(self):
+            self.inner, self.steps = dpc.systems.OscillatingMasses(), 0
+            self.reset = self.inner.reset
+
+        def step(self, u):
+            self.steps += 1
+            return self.inner.step(u)
+
+    plant = Bare()
+    log = dpc.simulate(plant, dpc.DPCController(small_layer(), 3), Y_REF, steps=4, reset=False)
+    assert plant.steps == 1 + 3 + 4 and log.y.shape == (4, 4)

@@ -89,7 +89,7 @@ def collect(
     check_count("steps", steps)
     check_count("hold", hold)
     size = torch.as_tensor(amplitude, dtype=torch.float64).expand(plant.n_u)
-    y = _start(plant, reset)
+    y = _start(plant, reset, torch.zeros(plant.n_u, dtype=torch.float64))
     inputs, outputs = [], []
     for k in range(steps):
         if k % hold == 0:
@@ -127,7 +127,8 @@ def simulate(
         u_ref: input reference, `(n_u,)` or a trajectory, likewise; zero by default.
         attack: (u_ini, y_ini, *, y_ref, u_ref, generator, step) -> p, shape of y_ini.
         generator: handed to the attack.
-        reset: whether to reset the plant, or the arguments of its reset.
+        reset: whether to reset the plant, or the arguments of its reset. A plant that is not reset and has no
+            `measure()` makes one more step at `u_warmup`, to learn its present output.
         u_warmup: input before step 0, a number or `(n_u,)`.
         progress: called with 1 after every step.
 
@@ -146,8 +147,8 @@ def simulate(
     u_refs = _trajectory("u_ref", torch.zeros(data.n_u) if u_ref is None else u_ref, steps, data.n_u, data.horizon)
     controller.reset()
     us, ys, ps, statuses = [], [], [], []
-    y = _start(plant, reset)
     warmup = torch.as_tensor(u_warmup, dtype=torch.float64).expand(data.n_u)
+    y = _start(plant, reset, warmup)
     for _ in range(data.t_ini):
         us.append(warmup)
         ys.append(y)
@@ -176,16 +177,14 @@ def simulate(
     )
 
 
-def _start(plant: Plant, reset: bool | Mapping[str, Any]) -> Tensor:
-    """Reset the plant, or read its present output by holding still for no time at all."""
+def _start(plant: Plant, reset: bool | Mapping[str, Any], u: Tensor) -> Tensor:
+    """Reset the plant, or read its present output; a plant without `measure()` has to make a step at u for that."""
     if isinstance(reset, Mapping):
         return plant.reset(**reset)
     if reset:
         return plant.reset()
     measure = getattr(plant, "measure", None)
-    if measure is None:
-        raise ValueError("`reset=False` needs a plant with a `measure()` method that returns its present output.")
-    return measure()
+    return plant.step(u) if measure is None else measure()
 
 
 def _trajectory(name: str, value: Any, steps: int, channels: int, horizon: int) -> Tensor:
