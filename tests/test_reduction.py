@@ -235,3 +235,15 @@ def test_gradients_of_trajectories_through_M(which):
         with torch.no_grad():
             expected = (loss(x + 1e-6 * v) - loss(x - 1e-6 * v)) / 2e-6
         assert float((x.grad * v).sum()) == pytest.approx(float(expected), rel=THROUGH_DATA)
+
+
+def test_a_second_derivative_with_respect_to_the_data_is_refused():
+    plant = dpc.systems.OscillatingMasses(noise=0.02, generator=torch.Generator().manual_seed(5))
+    u, y = dpc.collect(plant, 140, generator=torch.Generator().manual_seed(0))
+    y_data = y.clone().requires_grad_()
+    data = dpc.HankelData.from_trajectories(u, y_data, t_ini=4, horizon=8)
+    plan = dpc.DPCLayer(data, 1.0, 0.5, 1.0, 50.0)(u[20:24], y[20:24], y_ref=torch.ones(4))
+    cost = plan.u.square().sum()
+    with pytest.raises(NotImplementedError, match="first order"):
+        torch.autograd.grad(cost, y_data, create_graph=True)
+    assert torch.isfinite(torch.autograd.grad(cost, y_data)[0]).all()

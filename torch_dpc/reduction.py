@@ -97,7 +97,9 @@ class DataRows:
                 "(dropped), relative to the largest."
             )
         basis = space.basis.to(device)
-        Up, Yp, Uf, Yf = (m.to(device=device, dtype=torch.float64) @ basis for m in data.matrices)
+        stacked = torch.cat([m.to(device=device, dtype=torch.float64) for m in data.matrices])
+        rows = _InRowSpace.apply(stacked, basis) if carries_derivative(data.matrices) else stacked @ basis
+        Up, Yp, Uf, Yf = rows.split([len(m) for m in data.matrices])
         with torch.no_grad():
             left, singular, right_h = torch.linalg.svd(Up, full_matrices=True)
             # The rank of Up is judged on channels of one scale too: rows are few and alike, its own norm will do.
@@ -107,6 +109,31 @@ class DataRows:
             u_ini_range = None if rank == Up.shape[0] else left[:, :rank].contiguous()
             Z = right_h[rank:].T.contiguous()
         return DataRows(Up, Yp, Uf, Yf, torch.cat([Uf, Yf]), Up_pinv, Z, u_ini_range, space.rank_W)
+
+
+class _InRowSpace(torch.autograd.Function):
+    """(D, B) -> D B for an orthonormal basis B of the rows of D, which moves with D.
+
+    What follows depends on D through D D' alone, so that to first order, and only so, B may be taken as fixed:
+    D_bar = bar B'. A derivative of that is refused.
+    """
+
+    @staticmethod
+    def forward(D: Tensor, basis: Tensor) -> Tensor:  # noqa: D102
+        return D @ basis
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:  # noqa: D102
+        ctx.save_for_backward(inputs[1])
+
+    @staticmethod
+    def backward(ctx: Any, bar: Tensor) -> tuple[Tensor, None]:  # noqa: D102
+        if torch.is_grad_enabled() and bar.requires_grad:
+            raise NotImplementedError(
+                "the derivative with respect to the recorded data is of first order: it cannot be taken with "
+                "`create_graph=True`. Detach the data, or ask for first derivatives."
+            )
+        return bar @ ctx.saved_tensors[0].mT, None
 
 
 @dataclass(frozen=True, eq=False)
