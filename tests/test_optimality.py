@@ -20,6 +20,8 @@ from helpers import (
     small_layer,
     windows,
 )
+from torch_dpc import CompactForm
+from torch_dpc.projected_kkt import optimality_map
 
 #: F relative to its terms, 1e-8 at most. A w found here by least squares is no better than its condition (lambda_s).
 F_TOLERANCE = {"lam": 1e-10, "least squares": 1e-9}
@@ -47,6 +49,10 @@ def paper_F(layer, sol, u_ini, y_ini, i, w_from, **refs):
     pushed = z - slope - H.T @ w
     pushed[:n] = torch.minimum(torch.maximum(pushed[:n], lower), upper)
     F1, F2 = z - pushed, H @ z - b
+    # The package's own map says the same, to the rounding of its terms.
+    rounding = 1e-12 * (1 + (P.abs() @ z.abs()).max() + q.abs().max() + (H.T @ w).abs().max()).item()
+    ours = optimality_map(CompactForm(P, q, H, b), z, w, lower, upper)
+    torch.testing.assert_close(ours, torch.cat([F1, F2]), rtol=0, atol=rounding)
     parts = []
     n_u = layer.data.horizon * layer.data.n_u
     for block in (slice(0, n_u), slice(n_u, n), slice(n, None)):

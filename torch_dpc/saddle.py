@@ -72,12 +72,4 @@ class _SaddleSolve(torch.autograd.Function):
             s, t = _SaddleSolve.apply(Psi, Up, a_bar, mu_bar, s, t, saddle)
         Psi_bar = -s @ a.mT
         Up_bar = -(mu @ s.mT + t @ a.mT)
-        return (
-            Psi_bar.sum_to_size(Psi.shape),
-            Up_bar.sum_to_size(Up.shape),
-            s,
-            t.sum_to_size(ctx.bottom_shape) if hasattr(ctx, "bottom_shape") else t,
-            None,
-            None,
-            None,
-        )
+        return Psi_bar.sum_to_size(Psi.shape), Up_bar.sum_to_size(Up.shape), s, t, None, None, None
