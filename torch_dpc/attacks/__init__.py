@@ -1,9 +1,11 @@
 """Attacks on the measurements: costs, budgets, and how to choose a perturbation."""
 
-from .budgets import Ball, Box, Budget, Ellipsoid, RelativeBall
-from .costs import Cost, TargetInput
+from .budgets import Ball, Budget, L1Ball, PerChannel, RelativeBall, SparseBall
+from .costs import Cost, TargetInput, TrackingError
+from .entry_budgets import Box, Ellipsoid
 from .gradient import LinearizedAttack
 from .iterative import FrankWolfeAttack, ProjectedGradientAttack
+from .predictor import Predictor
 from .random import RandomAttack
 
 __all__ = [
@@ -13,9 +15,14 @@ __all__ = [
     "Cost",
     "Ellipsoid",
     "FrankWolfeAttack",
+    "L1Ball",
     "LinearizedAttack",
+    "PerChannel",
+    "Predictor",
     "ProjectedGradientAttack",
     "RandomAttack",
     "RelativeBall",
+    "SparseBall",
     "TargetInput",
+    "TrackingError",
 ]

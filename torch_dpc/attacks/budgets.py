@@ -1,7 +1,8 @@
 """What an attacker may add to the measured window: the admissible sets of p.
 
-Every budget works on windows `(*batch, t_ini, n_y)` and takes the window itself as the second argument, because some
-are relative to it.
+Every budget works on windows `(*batch, t_ini, n_y)` and takes the window itself as the second argument: with
+`relative=True` the size that a budget was given is a fraction of |y_ini|, in the budget's own norm and over the entries
+that share this size. A relative budget at y_ini = 0 is {0}.
 """
 
 from __future__ import annotations
@@ -13,113 +14,227 @@ from torch import Tensor
 
 
 class Budget:
-    """An admissible set of perturbations p, convex and containing zero."""
+    """An admissible set of perturbations p: closed, and with every p it holds s p, 0 <= s <= 1.
+
+    Write your own by giving `minimize_linear` and `project`.
+    """
+
+    #: Whether the set is convex, so that a mean of two admissible perturbations is admissible.
+    convex = True
 
     def minimize_linear(self, c: Tensor, y_ini: Tensor) -> Tensor:
         """Return argmin over the set of <c, p>, and 0 where c = 0; all `(*batch, t_ini, n_y)`."""
         raise NotImplementedError
 
     def project(self, p: Tensor, y_ini: Tensor) -> Tensor:
-        """Return the nearest admissible perturbation."""
+        """Return the nearest admissible perturbation, in the Euclidean norm."""
         raise NotImplementedError
 
     def random(self, y_ini: Tensor, generator: torch.Generator | None = None) -> Tensor:
         """Return a random perturbation that spends the whole budget."""
-        v = torch.randn(y_ini.shape, dtype=y_ini.dtype, device=y_ini.device, generator=generator)
-        return self.minimize_linear(-v, y_ini)
+        return self.minimize_linear(-_normal(y_ini, generator), y_ini)
 
     def excess(self, p: Tensor, y_ini: Tensor) -> Tensor:
         """Return how far p is outside the set, relative to its size, `(*batch,)`; zero or less when admissible."""
-        outside = _norm(p - self.project(p, y_ini)).flatten(-2)[..., 0]
-        return outside / _norm(p).flatten(-2)[..., 0].clamp_min(torch.finfo(p.dtype).tiny)
+        outside = euclidean(p - self.project(p, y_ini))[..., 0, 0]
+        return outside / euclidean(p)[..., 0, 0].clamp_min(torch.finfo(p.dtype).tiny)
 
 
 class Ball(Budget):
-    """|p| <= radius, Euclidean over the whole window, in the units of the outputs.
+    """|p| <= radius, Euclidean over the whole window.
+
+    Args:
+        radius: a number, or `(*batch,)`, one a sample, in the units of the outputs.
+        relative: |p| <= radius |y_ini| instead.
 
     Example:
         >>> Ball(2.0).minimize_linear(torch.tensor([[3.0], [4.0]]), torch.zeros(2, 1))
         tensor([[-1.2000], [-1.6000]])
     """
 
-    def __init__(self, radius: Any):
-        self.radius = _nonnegative("radius", radius)
+    _name = "radius"
 
-    def _radius(self, y_ini: Tensor) -> Tensor:
-        return self.radius.to(y_ini).reshape(*self.radius.shape, 1, 1)
+    def __init__(self, radius: Any, *, relative: bool = False):
+        self.radius = nonnegative(self._name, radius)
+        self.relative = relative
 
     def minimize_linear(self, c: Tensor, y_ini: Tensor) -> Tensor:
-        return -self._radius(y_ini) * _direction(c)
+        return -self._reach(y_ini) * direction(c)
 
     def project(self, p: Tensor, y_ini: Tensor) -> Tensor:
-        size = _norm(p)
-        return p * torch.where(size > 0, self._radius(y_ini) / size, 1.0).clamp_max(1.0)
+        return p * _shrink(euclidean(p), self._reach(y_ini))
+
+    def excess(self, p: Tensor, y_ini: Tensor) -> Tensor:
+        return ratio(self._norm(p), self._reach(y_ini))[..., 0, 0] - 1
+
+    def _reach(self, y_ini: Tensor) -> Tensor:
+        """Return the largest size of p, `(*batch, 1, 1)`."""
+        reach = self.radius.to(y_ini).reshape(*self.radius.shape, 1, 1)
+        return reach * self._norm(y_ini) if self.relative else reach
+
+    def _norm(self, p: Tensor) -> Tensor:
+        """Return the norm that is bounded, `(*batch, 1, 1)`."""
+        return euclidean(p)
 
 
 class RelativeBall(Ball):
-    """|p| <= rho |y_ini|, the paper's budget. At y_ini = 0 it is {0}."""
+    """|p| <= rho |y_ini|, the paper's budget: `Ball(rho, relative=True)`."""
+
+    _name = "rho"
 
     def __init__(self, rho: Any):
-        self.rho = _nonnegative("rho", rho)
-        super().__init__(self.rho)
-
-    def _radius(self, y_ini: Tensor) -> Tensor:
-        return super()._radius(y_ini) * _norm(y_ini)
+        super().__init__(rho, relative=True)
+        self.rho = self.radius
 
 
-class Box(Budget):
-    """|p_ti| <= radius for every entry: a number, or `(n_y,)`, or `(t_ini, n_y)`, in the units of the outputs."""
+class L1Ball(Ball):
+    """sum |p_ti| <= radius: few large entries cost as much as many small ones.
 
-    def __init__(self, radius: Any):
-        self.radius = _nonnegative("radius", radius)
+    The linear minimiser puts everything on one entry. The projection sorts the entries (Duchi, Shalev-Shwartz, Singer,
+    Chandra 2008).
 
-    def minimize_linear(self, c: Tensor, y_ini: Tensor) -> Tensor:
-        return -self.radius.to(y_ini) * c.sign()
+    Args:
+        radius: a number, or `(*batch,)`, one a sample, in the units of the outputs.
+        relative: sum |p_ti| <= radius sum |y_ti| instead.
 
-    def project(self, p: Tensor, y_ini: Tensor) -> Tensor:
-        return torch.minimum(torch.maximum(p, -self.radius.to(p)), self.radius.to(p))
-
-
-class Ellipsoid(Budget):
-    """sum (p_ti / scale_ti)^2 <= 1: the scale is the reach along each axis, `(n_y,)` or `(t_ini, n_y)`.
-
-    A channel with scale 0 cannot be touched.
+    Example:
+        >>> L1Ball(2.0).project(torch.tensor([[3.0], [2.0]]), torch.zeros(2, 1))
+        tensor([[1.5000], [0.5000]])
     """
 
-    def __init__(self, scale: Any):
-        self.scale = _nonnegative("scale", scale)
-
     def minimize_linear(self, c: Tensor, y_ini: Tensor) -> Tensor:
-        scale = self.scale.to(y_ini)
-        return -scale * _direction(scale * c)
+        flat = c.flatten(-2)
+        largest = flat.abs().argmax(-1, keepdim=True)
+        vertex = torch.zeros_like(flat).scatter(-1, largest, -flat.gather(-1, largest).sign())
+        return self._reach(y_ini) * vertex.reshape(c.shape)
 
     def project(self, p: Tensor, y_ini: Tensor) -> Tensor:
-        # p_i scale_i^2 / (scale_i^2 + mu), mu >= 0 the root of a decreasing function of one variable
-        square = self.scale.to(p).square().expand_as(p)
-        low = torch.zeros_like(_norm(p))
-        reached = torch.where(square > 0, p, 0.0)
-        high = _norm(p) * square.amax() ** 0.5 + square.amax()
-        for _ in range(200):  # bisection to the last bit
-            middle = (low + high) / 2
-            inside = _norm(reached * square.sqrt() / (square + middle)) <= 1
-            low, high = torch.where(inside, low, middle), torch.where(inside, middle, high)
-        outside = _norm(torch.where(square > 0, reached / square.sqrt(), 0.0)) > 1
-        return torch.where(outside, reached * square / (square + high), reached)
+        reach = self._reach(y_ini)
+        size = p.flatten(-2).abs().sort(dim=-1, descending=True).values
+        count = torch.arange(1, size.shape[-1] + 1, dtype=p.dtype, device=p.device)
+        threshold = (size.cumsum(-1) - reach[..., 0]) / count  # if the `count` largest entries are the ones that stay
+        stay = (size > threshold).sum(-1, keepdim=True).clamp_min(1)
+        by = threshold.gather(-1, stay - 1)[..., None].clamp_min(0.0)
+        shrunk = p.sign() * (p.abs() - by).clamp_min(0.0)
+        return shrunk * _shrink(self._norm(shrunk), reach)  # the rounding of a long sum
+
+    def random(self, y_ini: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        uniform = torch.rand(y_ini.shape, dtype=y_ini.dtype, device=y_ini.device, generator=generator)
+        p = _normal(y_ini, generator).sign() * -torch.log1p(-uniform)  # uniform on the surface
+        return p * self._reach(y_ini) / self._norm(p)
+
+    def _norm(self, p: Tensor) -> Tensor:
+        return p.abs().sum((-2, -1), keepdim=True)
 
 
-def _norm(p: Tensor) -> Tensor:
+class SparseBall(Ball):
+    """|p| <= radius on at most `channels` of the n_y sensors: the attacker holds a few of them, and chooses which.
+
+    The set is not convex, a union of balls, one for each choice. Both the linear minimiser and the projection are exact
+    all the same: the sensors with the largest |c_i|, and those with the largest |p_i|, each over the window.
+
+    Args:
+        channels: how many sensors may be touched.
+        radius: a number, or `(*batch,)`, one a sample, in the units of the outputs.
+        relative: |p| <= radius |y_ini| instead, |y_ini| over all sensors.
+
+    Example:
+        >>> SparseBall(1, 2.0).minimize_linear(torch.tensor([[3.0, 4.0]]), torch.zeros(1, 2))
+        tensor([[-0., -2.]])
+    """
+
+    convex = False
+
+    def __init__(self, channels: int, radius: Any, *, relative: bool = False):
+        if not isinstance(channels, int) or isinstance(channels, bool) or channels < 1:
+            raise ValueError(f"`channels` must be a positive integer, got {channels!r}.")
+        super().__init__(radius, relative=relative)
+        self.channels = channels
+
+    def minimize_linear(self, c: Tensor, y_ini: Tensor) -> Tensor:
+        return super().minimize_linear(self._keep_largest(c), y_ini)
+
+    def project(self, p: Tensor, y_ini: Tensor) -> Tensor:
+        return super().project(self._keep_largest(p), y_ini)
+
+    def excess(self, p: Tensor, y_ini: Tensor) -> Tensor:
+        touched = (p != 0).any(-2).sum(-1)
+        return torch.where(touched > self.channels, torch.inf, super().excess(p, y_ini))
+
+    def _keep_largest(self, p: Tensor) -> Tensor:
+        size = torch.linalg.vector_norm(p, dim=-2, keepdim=True)
+        chosen = size.topk(min(self.channels, p.shape[-1]), dim=-1).indices
+        return p * torch.zeros_like(size).scatter(-1, chosen, 1.0)
+
+
+class PerChannel(Budget):
+    """A budget for each channel on its own: `PerChannel(Ball([0.1, 0.2]))` is |p_i| <= radius_i over the window.
+
+    Args:
+        budget: a `Ball`, `RelativeBall` or `L1Ball`, whose radius may be `(n_y,)`, one a channel. A relative one is
+            relative to the channel's own part of y_ini.
+
+    Example:
+        >>> budget, y_ini = PerChannel(RelativeBall(0.1)), torch.tensor([[3.0, 0.0], [4.0, 20.0]])
+        >>> budget.project(torch.ones(2, 2), y_ini)
+        tensor([[0.3536, 1.0000], [0.3536, 1.0000]])
+    """
+
+    def __init__(self, budget: Budget):
+        if not isinstance(budget, Ball) or isinstance(budget, SparseBall):
+            raise ValueError(f"`budget` must be a Ball, RelativeBall or L1Ball, got {type(budget).__name__}.")
+        self.budget = budget
+
+    def minimize_linear(self, c: Tensor, y_ini: Tensor) -> Tensor:
+        return _joined(self.budget.minimize_linear(_split(c), _split(y_ini)))
+
+    def project(self, p: Tensor, y_ini: Tensor) -> Tensor:
+        return _joined(self.budget.project(_split(p), _split(y_ini)))
+
+    def random(self, y_ini: Tensor, generator: torch.Generator | None = None) -> Tensor:
+        return _joined(self.budget.random(_split(y_ini), generator))
+
+    def excess(self, p: Tensor, y_ini: Tensor) -> Tensor:
+        return self.budget.excess(_split(p), _split(y_ini)).amax(-1)
+
+
+def _split(p: Tensor) -> Tensor:
+    """Make one-channel windows of the channels, `(*batch, n_y, t_ini, 1)`."""
+    return p.mT[..., None]
+
+
+def _joined(p: Tensor) -> Tensor:
+    return p[..., 0].mT
+
+
+def _normal(y_ini: Tensor, generator: torch.Generator | None) -> Tensor:
+    return torch.randn(y_ini.shape, dtype=y_ini.dtype, device=y_ini.device, generator=generator)
+
+
+def euclidean(p: Tensor) -> Tensor:
     """Euclidean norm of each window, `(*batch, 1, 1)`."""
     return torch.linalg.vector_norm(p, dim=(-2, -1), keepdim=True)
 
 
-def _direction(c: Tensor) -> Tensor:
+def direction(c: Tensor) -> Tensor:
     """Return c / |c|, and 0 where c = 0."""
-    size = _norm(c)
+    size = euclidean(c)
     return torch.where(size > 0, c / torch.where(size > 0, size, 1.0), 0.0)
 
 
-def _nonnegative(name: str, value: Any) -> Tensor:
-    tensor = torch.as_tensor(value, dtype=torch.float64) if not isinstance(value, Tensor) else value.double()
+def ratio(size: Tensor, reach: Tensor) -> Tensor:
+    """Return size / reach: 0 where the size is 0, infinity where a size meets no reach."""
+    return torch.where(size > 0, size / reach, 0.0)
+
+
+def _shrink(size: Tensor, reach: Tensor) -> Tensor:
+    """Return the factor that brings a size within its reach."""
+    return torch.where(size > reach, reach / torch.where(size > 0, size, 1.0), 1.0)
+
+
+def nonnegative(name: str, value: Any) -> Tensor:
+    """Return a size as a float64 tensor, or say what is wrong with it."""
+    tensor = value.detach().double() if isinstance(value, Tensor) else torch.as_tensor(value, dtype=torch.float64)
     if not bool((tensor >= 0).all()) or not bool(torch.isfinite(tensor).all()):
         raise ValueError(f"`{name}` must be finite and not negative, got {value!r}.")
     return tensor
