@@ -6,6 +6,7 @@ from .entry_budgets import Box, Ellipsoid
 from .gradient import LinearizedAttack
 from .iterative import FrankWolfeAttack, ProjectedGradientAttack
 from .predictor import Predictor
+from .query import FiniteDifferenceAttack, RandomSearchAttack
 from .random import RandomAttack
 
 __all__ = [
@@ -14,6 +15,7 @@ __all__ = [
     "Budget",
     "Cost",
     "Ellipsoid",
+    "FiniteDifferenceAttack",
     "FrankWolfeAttack",
     "L1Ball",
     "LinearizedAttack",
@@ -21,6 +23,7 @@ __all__ = [
     "Predictor",
     "ProjectedGradientAttack",
     "RandomAttack",
+    "RandomSearchAttack",
     "RelativeBall",
     "SparseBall",
     "TargetInput",

@@ -1,8 +1,8 @@
 """What an attacker wants: costs psi of the planned trajectory, to be made small.
 
 A cost is any callable DPCSolution -> `(*batch,)`. Two optional methods let it know more than the plan: `at(step)`
-returns the cost of a plan made at a step of the run, and `given(u_ini=..., y_ini=..., y_ref=..., u_ref=...)` the cost of
-a plan made when the unattacked window and the references are these. Every attack asks for both, once a call.
+returns the cost of a plan made at a step of the run, and `given(u_ini=..., y_ini=..., y_ref=..., u_ref=...)` the cost
+of a plan made when the unattacked window and the references are these. Every attack asks for both, once a call.
 """
 
 from __future__ import annotations

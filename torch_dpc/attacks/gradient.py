@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from typing import Any
 
-import torch
 from torch import Tensor
 
 from ..layer import DPCLayer
@@ -31,6 +30,7 @@ class LinearizedAttack(IterativeAttack):
         budget: the admissible perturbations.
 
     Example:
+        >>> import torch
         >>> import torch_dpc as dpc
         >>> plant, generator = dpc.systems.OscillatingMasses(), torch.Generator().manual_seed(0)
         >>> u, y = dpc.collect(plant, 120, generator=generator)

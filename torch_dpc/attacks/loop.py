@@ -107,7 +107,7 @@ class IterativeAttack:
             step: of the run, for costs that move with it.
         """
         y_ini = as_data("y_ini", y_ini)
-        objective = self._objective(u_ini, y_ini, y_ref, u_ref, step)
+        objective = self._objective(u_ini, y_ini, y_ref, u_ref, step, generator=generator)
         for restart in range(self.restarts):
             walk = self._walk(objective, self._start(restart, objective.y_ini, generator), restart == 0)
             if restart == 0:
@@ -152,5 +152,6 @@ class IterativeAttack:
             walk.see(objective.psi(walk.p, active), walk.gradient)
         return walk
 
-    def _objective(self, u_ini: Any, y_ini: Tensor, y_ref: Any, u_ref: Any, step: int) -> Objective:
-        return Objective(self.layer, self.cost, u_ini, y_ini, y_ref, u_ref, step)
+    def _objective(self, *call: Any, generator: torch.Generator | None) -> Objective:
+        """Return what is minimised in a call with (u_ini, y_ini, y_ref, u_ref, step)."""
+        return Objective(self.layer, self.cost, *call)

@@ -48,10 +48,12 @@ class Objective:
         self.u_ini = _of_batch("u_ini", u_ini, self.batch)
         data = getattr(layer, "data", None)
         horizon = None if data is None else data.horizon
-        self.y_ref = _reference("y_ref", y_ref, horizon, self.batch)
-        self.u_ref = _reference("u_ref", u_ref, horizon, self.batch)
+        self.refs = {
+            "y_ref": _reference("y_ref", y_ref, horizon, self.batch),
+            "u_ref": _reference("u_ref", u_ref, horizon, self.batch),
+        }
         self.t_ini = y_ini.shape[-2] if data is None else data.t_ini
-        self.cost = bound(cost, step, self.u_ini, y_ini, self.y_ref, self.u_ref)
+        self.cost = bound(cost, step, self.u_ini, y_ini, **self.refs)
         self._last: DPCSolution | None = None
 
     def psi(self, p: Tensor, of: Tensor | None = None) -> Tensor:
@@ -61,18 +63,14 @@ class Objective:
             p: the perturbation, `(*batch, t_ini, n_y)`, float64.
             of: the samples that are asked for, `(*batch,)`, boolean; the others' values are those of the last call.
         """
-        everyone = of is None or bool(of.all())
-        chosen = (lambda x: x) if everyone else (lambda x: x[of])
-        u_ini, y_ini = last_rows(chosen(self.u_ini), self.t_ini), last_rows(chosen(self.y_ini + p), self.t_ini)
-        y_ref, u_ref = (r if r is None or r.ndim <= 2 else chosen(r) for r in (self.y_ref, self.u_ref))
-        solution = self._plan(u_ini, y_ini, y_ref, u_ref)
-        if of is not None and not everyone:
+        if is_everyone(of):
+            of = None
+        u_ini, y_ini = (last_rows(self._of(of, w), self.t_ini) for w in (self.u_ini, self.y_ini + p))
+        solution = self.layer(u_ini, y_ini, **self._refs_of(of), on_failure="nan")
+        if of is not None:
             solution = self._among_the_last(solution, of)
         self._last = _detached(solution)
-        psi = self.cost(solution)
-        if psi.shape != self.batch:
-            raise ValueError(f"`cost` must return one number a sample, {tuple(self.batch)}, got {tuple(psi.shape)}.")
-        return torch.where(self._solved(solution), psi, torch.inf)
+        return torch.where(solution.info.status == Status.SOLVED, self._judged(solution), torch.inf)
 
     def gradient(self, p: Tensor, of: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return psi and its gradient in p, zero where there is no plan and for samples not asked for."""
@@ -84,11 +82,19 @@ class Objective:
         psi = psi.detach()
         return psi, torch.where(psi.isfinite()[..., None, None], gradient, 0.0)
 
-    def _plan(self, u_ini: Tensor, y_ini: Tensor, y_ref: Tensor | None, u_ref: Tensor | None) -> Any:
-        return self.layer(u_ini, y_ini, y_ref=y_ref, u_ref=u_ref, on_failure="nan")
+    def _judged(self, plan: Any) -> Tensor:
+        psi = self.cost(plan)
+        if psi.shape != self.batch:
+            raise ValueError(f"`cost` must return one number a sample, {tuple(self.batch)}, got {tuple(psi.shape)}.")
+        return psi
 
-    def _solved(self, solution: Any) -> Tensor:
-        return solution.info.status == Status.SOLVED
+    def _refs_of(self, of: Tensor | None) -> dict[str, Tensor | None]:
+        """Return the references of some samples; one that the batch shares is everyone's."""
+        return {n: r if r is None or r.ndim <= 2 else self._of(of, r) for n, r in self.refs.items()}
+
+    @staticmethod
+    def _of(of: Tensor | None, values: Tensor) -> Tensor:
+        return values if of is None else values[of]
 
     def _among_the_last(self, part: DPCSolution, of: Tensor) -> DPCSolution:
         """Put the plans of some samples among the last plans of all: a cost may know the batch it was made for."""
@@ -101,6 +107,11 @@ class Objective:
         info = SolveInfo(placed(part.info.table, last.info.table), part.info.is_selection)
         whole = {name: placed(getattr(part, name), getattr(last, name)) for name in ("u", "y", "lam")}
         return replace(part, info=info, _make_g=lambda: placed(part.g, last.g), **whole)
+
+
+def is_everyone(of: Tensor | None) -> bool:
+    """Return whether a choice of samples leaves nobody out."""
+    return of is None or bool(of.all())
 
 
 def psi_and_gradient(
