@@ -6,13 +6,14 @@ from .errors import ExcitationWarning, InfeasibleError, SolveError, Status
 from .hankel import HankelData, excitation_order, hankel
 from .layer import DPCLayer
 from .problem import CompactForm
-from .sets import Box, ConvexSet, Reals
+from .sets import Ball, Box, ConvexSet, NonNegative, Product, Reals, SecondOrderCone, SoftBox
 from .simulation import ClosedLoopLog, Plant, collect, simulate
 from .solution import DPCSolution, SolveInfo
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "Ball",
     "Box",
     "ClosedLoopLog",
     "CompactForm",
@@ -23,8 +24,12 @@ __all__ = [
     "ExcitationWarning",
     "HankelData",
     "InfeasibleError",
+    "NonNegative",
     "Plant",
+    "Product",
     "Reals",
+    "SecondOrderCone",
+    "SoftBox",
     "SolveError",
     "SolveInfo",
     "Status",
