@@ -18,7 +18,7 @@ from .problem import Sizes
 from .projected_system import Implicit, solve_system
 from .reduction import Reduction
 from .solve import ACCEPTED, Planned, check_finite, report_failures
-from .splitting import scale_of, solve_splitting
+from .splitting import scale_of, solve_convex
 
 #: Eigenvalues of D1 below this hold their direction.
 HELD = 1e-9
@@ -43,9 +43,9 @@ class ConvexSolver:
     on_failure: str
 
     @cached_property
-    def gamma(self) -> float:
-        """The scale of the multipliers."""
-        return scale_of(self.reduction.G)
+    def gamma(self) -> Tensor:
+        """The scale of the multipliers, `(N,)`."""
+        return scale_of(self._G, self.sets)
 
     @cached_property
     def _G(self) -> Tensor:
@@ -86,22 +86,23 @@ class ConvexSolver:
     def find(self, theta: Tensor) -> tuple[Tensor, ...]:
         """Return v, lam, weak and active rows in part order, `(*batch, N)`, and info `(*batch, 5)`."""
         check_finite(theta, self.sizes)
-        shape = self.sets.prox(theta.new_zeros(self._G.shape[-1])).shape[:-1]  # of sets that differ sample by sample
+        shape = self.sets.batch_shape
         batch = torch.broadcast_shapes(theta.shape[:-1], shape, self.reduction.V.shape[:-2])
         theta = theta.expand(*batch, theta.shape[-1])
-        if batch and theta[..., 0].numel() > CHUNK and not shape and self._G.ndim == 2:
-            flat = theta.reshape(-1, theta.shape[-1]).split(CHUNK)
-            found = [torch.cat(parts) for parts in zip(*map(self._solve, flat), strict=True)]
-            found = [x.reshape(*batch, x.shape[-1]) for x in found]
-        else:
+        if shape:
             found = list(self._solve(theta))
+        else:
+            one_each = self if self._G.ndim == 2 else replace(self, reduction=self.reduction.of_batch(batch))
+            flat = theta.reshape(-1, theta.shape[-1])
+            chunks = [one_each._solve(part) for part in flat.split(CHUNK)] if self._G.ndim == 2 else [one_each._solve(flat)]
+            found = [torch.cat(parts).reshape(*batch, parts[0].shape[-1]) for parts in zip(*chunks, strict=True)]
         report_failures(found[-1].reshape(-1, found[-1].shape[-1]), batch, self.on_failure)
         return tuple(found)
 
     def _solve(self, theta: Tensor) -> tuple[Tensor, ...]:
         sets, gamma, order = self.sets, self.gamma, self.sets.order.to(theta.device)
         a0, v0 = self._optimality.unconstrained(theta)
-        found = solve_splitting(self._G, v0[..., order], sets, gamma)
+        found = solve_convex(self._G, self._Ct, v0[..., order], sets, gamma)
         lam = found.lam
         a = a0 - times(self.reduction.A_lam, lam[..., sets.inverse.to(theta.device)])
         raw = times(self.reduction.rows.C, a)
@@ -121,14 +122,16 @@ class ConvexSolver:
         info = [status, found.iterations, residual, active.sum(-1), sets.touching(v, weak, reach)]
         out = [v, lam, weak.expand_as(v), active, torch.stack([i.double().expand(status.shape) for i in info], dim=-1)]
         if bool(failed.any()):
-            self._mark_failures(theta, v0[..., order], failed, out)
+            self._mark_failures(theta, v0[..., order], found.gap, failed, out)
         return tuple(out)
 
-    def _mark_failures(self, theta: Tensor, v0: Tensor, failed: Tensor, out: list[Tensor]) -> None:
+    def _mark_failures(
+        self, theta: Tensor, v0: Tensor, gap: Tensor, failed: Tensor, out: list[Tensor]
+    ) -> None:
         """Look for certificates; leave nothing of a sample without a solution."""
         v, lam, weak, active, info = out
         unreachable = self.reduction.rows.unreachable(theta)
-        proven = separates_from_set(self._Ct, v0, self.sets, self.gamma, failed & ~unreachable)
+        proven = separates_from_set(self._Ct, v0, self.sets, gap)
         info[..., 0] = torch.where(failed & (proven | unreachable), float(Status.INFEASIBLE), info[..., 0])
         for emptied in (v, lam, active, info[..., 3:]):
             emptied[failed] = 0
@@ -162,7 +165,7 @@ class _Find(torch.autograd.Function):
         return outputs, (0,) * len(outputs)
 
 
-def is_nonsingular(G: Tensor, sets: FeasibleSet, x: Tensor, weak: Tensor, gamma: float) -> Tensor:
+def is_nonsingular(G: Tensor, sets: FeasibleSet, x: Tensor, weak: Tensor, gamma: Tensor) -> Tensor:
     """Return whether the projected system at a solution is nonsingular, `(...)`."""
     blocks = sets.freed(sets.jacobians(x, gamma), weak)
     return solve_system(G, sets, blocks, torch.zeros_like(x), gamma)[1]

@@ -68,6 +68,11 @@ class FeasibleSet:
         return tuple(2 if owner.separable else 3 for owner, _ in self.parts)
 
     @property
+    def batch_shape(self) -> torch.Size:
+        """The batch dimensions that the sets' own parameters have."""
+        return self.prox(torch.zeros(len(self.order), dtype=torch.float64)).shape[:-1]
+
+    @property
     def is_box(self) -> bool:
         """Whether all sets together are a box."""
         return all(isinstance(owner, Box) for owner, _ in self.parts)
@@ -84,16 +89,41 @@ class FeasibleSet:
         inverse = self.inverse.to(device)
         return _joined(sides[0])[..., inverse], _joined(sides[1])[..., inverse]
 
-    def prox(self, x: Tensor, gamma: float = 1.0) -> Tensor:
-        """Return the projection of x, `(..., N)`; the proximal map where a penalty stands in place of a set."""
-        return _joined([owner.prox(self._group(x, at, shape), gamma).flatten(-2) for owner, at, shape in self._slices])
+    def prox(self, x: Tensor, gamma: Tensor | float = 1.0) -> Tensor:
+        """Return the projection of x, `(..., N)`; the proximal map where a penalty stands in place of a set.
 
-    def jacobians(self, x: Tensor, gamma: float) -> Blocks:
+        gamma is one number, or `(..., N)`, equal within every group.
+        """
+        return _joined(
+            [
+                owner.prox(self._group(x, at, shape), self._scale(gamma, at, shape)).flatten(-2)
+                for owner, at, shape in self._slices
+            ]
+        )
+
+    def jacobians(self, x: Tensor, gamma: Tensor | float) -> Blocks:
         """Return D1 at x."""
         return [
-            (owner.jacobian_diagonal if owner.separable else owner.jacobian)(self._group(x, at, shape), gamma)
+            (owner.jacobian_diagonal if owner.separable else owner.jacobian)(
+                self._group(x, at, shape), self._scale(gamma, at, shape)
+            )
             for owner, at, shape in self._slices
         ]
+
+    def largest_of_group(self, x: Tensor) -> Tensor:
+        """Return x, `(N,)`, with the largest entry of its group in place of each."""
+        groups = [(self._group(x, at, shape), shape) for _, at, shape in self._slices]
+        return torch.cat([group.amax(-1, keepdim=True).expand(shape).flatten() for group, shape in groups])
+
+    def complement_times(self, blocks: Blocks, matrix: Tensor) -> Tensor:
+        """Return (I - D1) matrix, `(..., N, k)`."""
+        out = []
+        for (owner, at, shape), D in self._with(blocks):
+            rows = matrix[..., at, :].unflatten(-2, shape)  # (..., groups, size, k)
+            moved = D[..., None] * rows if owner.separable else D @ rows
+            out.append((rows - moved).flatten(-3, -2))
+        batch = torch.broadcast_shapes(*(part.shape[:-2] for part in out))
+        return torch.cat([part.expand(*batch, *part.shape[-2:]) for part in out], dim=-2)
 
     def freed(self, blocks: Blocks, weak: Tensor) -> Blocks:
         """Return D1 with the identity at the rows that count as inactive, `(..., N)`; a block is freed as a whole."""
@@ -181,6 +211,11 @@ class FeasibleSet:
 
     def _with(self, blocks: Blocks) -> Iterable[tuple[tuple[ConvexSet, slice, tuple[int, ...]], Tensor]]:
         return zip(self._slices, blocks, strict=True)
+
+    @staticmethod
+    def _scale(gamma: Tensor | float, at: slice, shape: tuple[int, ...]) -> Tensor | float:
+        """gamma of each group, `(..., groups, 1)`."""
+        return gamma if isinstance(gamma, float) else gamma[..., at].unflatten(-1, shape)[..., :1]
 
     @staticmethod
     def _group(x: Tensor, at: slice, shape: tuple[int, ...]) -> Tensor:

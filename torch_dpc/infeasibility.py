@@ -66,40 +66,32 @@ def _separates(d: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) 
     return bool(margin > MARGIN * size) and bool(margin > FAR * (1 + size) * leak)
 
 
-#: Splitting steps whose displacement points from the sets to the trajectories, and rounds that make of it a direction.
-DISPLACEMENT_STEPS, ALTERNATIONS = 3000, 60
+#: Rounds that make a direction of a gap.
+ALTERNATIONS = 60
 
 
-def separates_from_set(Ct: Tensor, v0: Tensor, sets: FeasibleSet, gamma: float, doubtful: Tensor) -> Tensor:
-    """Return which doubtful samples are proven to have no v = v0 + Ct x in the sets.
+def separates_from_set(Ct: Tensor, v0: Tensor, sets: FeasibleSet, gap: Tensor) -> Tensor:
+    """Return which samples, `(...)`, are proven to have no v = v0 + Ct x in the sets.
 
-    The displacement of Douglas-Rachford splitting tends to the shortest way from the sets to the trajectories
-    (Banjac, Goulart, Stellato, Boyd 2019). Brought into the kernel of Ct' and to where the sets are bounded, a direction d
-    with d'v0 > sup {d'v : v in the sets} is a proof, whoever found it.
+    The shortest way from the sets to the trajectories, brought into the kernel of Ct' and to where the sets are
+    bounded, is a direction d; d'v0 > sup {d'v : v in the sets} is a proof, whoever found it.
 
     Args:
         Ct: `(N, n_x)`, or one a sample, in part order.
-        v0, sets, gamma: as for :func:`torch_dpc.splitting.solve_splitting`.
-        doubtful: `(...)`.
+        v0: `(..., N)`.
+        sets: all sets.
+        gap: a guess of that way, `(..., N)`; zero where there is none.
     """
-    vectors, singular, _ = torch.linalg.svd(Ct, full_matrices=True)
-    singular = torch.nn.functional.pad(singular, (0, vectors.shape[-1] - singular.shape[-1]))
-    shrink = 1 / (gamma + singular.square())
-    in_kernel = (singular <= DEPENDENT * singular.amax(-1, keepdim=True)).to(Ct)
-    state, moved = v0.clone(), torch.zeros_like(v0)
-    for _ in range(DISPLACEMENT_STEPS if bool(doubtful.any()) else 0):
-        nearest = sets.prox(state, gamma)
-        behind = 2 * nearest - state
-        lam = times(vectors, shrink * times(vectors.mT, v0 - behind))
-        moved = behind + gamma * lam - nearest
-        state = state + moved
+    left, singular, _ = torch.linalg.svd(Ct, full_matrices=False)
+    span = left * (singular > DEPENDENT * singular.amax(-1, keepdim=True)).to(Ct)[..., None, :]
     norm = torch.linalg.vector_norm
-    d = moved
+    d = gap
     for _ in range(ALTERNATIONS):
-        d = sets.bounded_direction(times(vectors, in_kernel * times(vectors.mT, d)))
+        d = sets.bounded_direction(d - times(span, times(span.mT, d)))
         d = d / norm(d, dim=-1, keepdim=True).clamp_min(torch.finfo(d.dtype).tiny)
     most = sets.support(d)
     margin = (d * v0).sum(-1) - most
     size = norm(v0, dim=-1) + most.abs()
     leak = norm(times(Ct.mT, d), dim=-1)
-    return doubtful & most.isfinite() & (margin > MARGIN * size) & (margin > FAR * (1 + size) * leak)
+    # x with |x| > margin / leak are not excluded: demand that they be absurdly far away.
+    return most.isfinite() & (margin > MARGIN * size) & (margin > FAR * (1 + size) * leak)

@@ -32,7 +32,7 @@ TRUSTED, DEPENDENT = 1e-10, 1e-13
 
 
 def solve_system(
-    G: Tensor, sets: FeasibleSet, blocks: Blocks, rhs: Tensor, gamma: float, *, transposed: bool = False
+    G: Tensor, sets: FeasibleSet, blocks: Blocks, rhs: Tensor, gamma: Tensor, *, transposed: bool = False
 ) -> tuple[Tensor, Tensor]:
     """Return K^-1 rhs, or K'^-1 rhs, `(..., N)`, and whether K was nonsingular, `(...)`; minimum norm where it was not.
 
@@ -41,7 +41,7 @@ def solve_system(
         sets: the structure of D.
         blocks: D.
         rhs: `(..., N)`.
-        gamma: the scale of the multipliers.
+        gamma: the scale of the multipliers, `(N,)`, equal within each block.
         transposed: solve with K'.
     """
     d, vectors = sets.spectral(blocks)
@@ -50,12 +50,12 @@ def solve_system(
     held = d < 1 - FREE
     rows = held.reshape(-1, held.shape[-1]).any(0).nonzero()[:, 0]
     turned = sets.rotate_matrix(vectors, G)
-    free = torch.where(held, 0.0, b / gamma)
+    free = torch.where(held, 0.0, b / gamma)  # gamma is one number in each block, so that it needs no turning
     if len(rows) == 0:
         return sets.rotate(vectors, free, back=True), torch.ones(b.shape[:-1], dtype=torch.bool, device=b.device)
     on = held[..., rows]
     lack = torch.where(on, 1 - d[..., rows], 1.0)
-    curvature = torch.where(on, gamma * d[..., rows] / lack, 1.0)
+    curvature = torch.where(on, gamma[rows] * d[..., rows] / lack, 1.0)
     matrix = turned[..., rows[:, None], rows] * (on[..., :, None] & on[..., None, :]) + torch.diag_embed(curvature)
     right = b[..., rows] if transposed else b[..., rows] / lack - times(turned[..., rows, :], free)
     y, regular = _symmetric_solve(matrix, torch.where(on, right, 0.0))
@@ -94,7 +94,7 @@ class SolveSystem(torch.autograd.Function):
     """
 
     @staticmethod
-    def forward(rhs: Tensor, G: Tensor, sets: FeasibleSet, gamma: float, transposed: bool, *blocks: Tensor) -> Tensor:
+    def forward(rhs: Tensor, G: Tensor, sets: FeasibleSet, gamma: Tensor, transposed: bool, *blocks: Tensor) -> Tensor:
         return solve_system(G, sets, list(blocks), rhs, gamma, transposed=transposed)[0]
 
     @staticmethod
@@ -153,7 +153,7 @@ class Implicit(torch.autograd.Function):
     @staticmethod
     def forward(
         v0: Tensor, G: Tensor, projected: Tensor, v: Tensor, lam: Tensor, solved: Tensor, weak: Tensor,
-        sets: FeasibleSet, gamma: float,
+        sets: FeasibleSet, gamma: Tensor,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         return torch.where(solved, v, torch.nan), lam.clone()
 

@@ -51,11 +51,14 @@ class ConvexSet(nn.Module):
         """Return the Euclidean projection of x, `(..., n)`."""
         raise NotImplementedError(f"{type(self).__name__} must define `project`.")
 
-    def prox(self, x: Tensor, gamma: float) -> Tensor:
-        """Return the proximal map of the set's indicator, its projection; a penalty in place of a set has another."""
+    def prox(self, x: Tensor, gamma: Any) -> Tensor:
+        """Return the proximal map of the set's indicator, its projection; a penalty in place of a set has another.
+
+        gamma is a number, or a tensor `(..., 1)`.
+        """
         return self.project(x)
 
-    def jacobian(self, x: Tensor, gamma: float = 1.0) -> Tensor:
+    def jacobian(self, x: Tensor, gamma: Any = 1.0) -> Tensor:
         """Return D1, the Jacobian of the projection (of `prox`) at x, `(..., n, n)`; it is symmetric."""
         value, product = torch.func.vjp(lambda x: self.prox(x, gamma), x)
         rows = []
@@ -66,7 +69,7 @@ class ConvexSet(nn.Module):
         D1 = torch.stack(rows, dim=-2)
         return (D1 + D1.mT) / 2
 
-    def jacobian_diagonal(self, x: Tensor, gamma: float = 1.0) -> Tensor:
+    def jacobian_diagonal(self, x: Tensor, gamma: Any = 1.0) -> Tensor:
         """Return the diagonal of D1, `(..., n)`, which is all of it where the set is `separable`."""
         return self.jacobian(x, gamma).diagonal(dim1=-2, dim2=-1)
 
@@ -177,10 +180,10 @@ class Box(ConvexSet):
         lower, upper = self.bounds(x)
         return torch.maximum(torch.minimum(x, upper), lower)
 
-    def jacobian(self, x: Tensor, gamma: float = 1.0) -> Tensor:
+    def jacobian(self, x: Tensor, gamma: Any = 1.0) -> Tensor:
         return torch.diag_embed(self.jacobian_diagonal(x, gamma))
 
-    def jacobian_diagonal(self, x: Tensor, gamma: float = 1.0) -> Tensor:
+    def jacobian_diagonal(self, x: Tensor, gamma: Any = 1.0) -> Tensor:
         lower, upper = self.bounds(x)
         return ((x >= lower) & (x <= upper) & (lower < upper)).to(x)
 
@@ -270,15 +273,15 @@ class SoftBox(ConvexSet):
     def project(self, x: Tensor) -> Tensor:
         return self.box.project(x)
 
-    def prox(self, x: Tensor, gamma: float) -> Tensor:
+    def prox(self, x: Tensor, gamma: Any) -> Tensor:
         pull = x - self.box.project(x)
         most = gamma * _as_tensor(self.weight).to(x)
         return x - torch.minimum(torch.maximum(pull, -most), most)
 
-    def jacobian(self, x: Tensor, gamma: float = 1.0) -> Tensor:
+    def jacobian(self, x: Tensor, gamma: Any = 1.0) -> Tensor:
         return torch.diag_embed(self.jacobian_diagonal(x, gamma))
 
-    def jacobian_diagonal(self, x: Tensor, gamma: float = 1.0) -> Tensor:
+    def jacobian_diagonal(self, x: Tensor, gamma: Any = 1.0) -> Tensor:
         pull = (x - self.box.project(x)).abs()
         held = (pull > 0) & (pull <= gamma * _as_tensor(self.weight).to(x))
         return (~held).to(x)
@@ -342,7 +345,7 @@ class Ball(ConvexSet):
         center, direction, distance, radius = self._polar(x)
         return torch.where(distance > radius, center + radius * direction, x)
 
-    def jacobian(self, x: Tensor, gamma: float = 1.0) -> Tensor:
+    def jacobian(self, x: Tensor, gamma: Any = 1.0) -> Tensor:
         _, direction, distance, radius = self._polar(x)
         eye = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
         outside = (distance > radius)[..., None]
@@ -393,7 +396,7 @@ class SecondOrderCone(ConvexSet):
         between = torch.cat([half, half * direction], dim=-1)
         return torch.where(norm <= head, x, torch.where(norm <= -head, torch.zeros_like(x), between))
 
-    def jacobian(self, x: Tensor, gamma: float = 1.0) -> Tensor:
+    def jacobian(self, x: Tensor, gamma: Any = 1.0) -> Tensor:
         head, norm, direction = (part[..., None] for part in self._polar(x))
         eye = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
         ratio = head / torch.where(norm > 0, norm, 1.0)
