@@ -290,7 +290,7 @@ class SoftBox(ConvexSet):
         return self.box.minimize_linear(c)
 
     def support(self, d: Tensor) -> Tensor:
-        return torch.where(d == 0, 0.0, math.inf).sum(-1)  # no point is out of the question
+        return torch.where(d == 0, torch.zeros_like(d), math.inf).sum(-1)  # no point is out of the question
 
     def bounded_direction(self, d: Tensor) -> Tensor:
         return torch.zeros_like(d)
@@ -413,7 +413,7 @@ class SecondOrderCone(ConvexSet):
 
     def support(self, d: Tensor) -> Tensor:
         head, norm, _ = self._polar(d)
-        return torch.where(norm <= -head, 0.0, math.inf)[..., 0]
+        return torch.where(norm <= -head, torch.zeros_like(norm), math.inf)[..., 0]
 
     def bounded_direction(self, d: Tensor) -> Tensor:
         return -self.project(-d)  # the polar cone
