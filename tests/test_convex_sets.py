@@ -57,9 +57,9 @@ CASES = {
             "u_set": dpc.Box(-0.5, 0.5),
             "y_set": dpc.Product([(dpc.Ball(0.8), [0, 1]), (dpc.Box(-0.5, 0.5), [2, 3])]),
         },
-        lambda cp, u, y: [cp.abs(s) <= 0.5 for s in u]
-        + [cp.norm(s[:2]) <= 0.8 for s in y]
-        + [cp.abs(s[2:]) <= 0.5 for s in y],
+        lambda cp, u, y: (
+            [cp.abs(s) <= 0.5 for s in u] + [cp.norm(s[:2]) <= 0.8 for s in y] + [cp.abs(s[2:]) <= 0.5 for s in y]
+        ),
     ),
     "soft outputs": (
         {"u_set": dpc.Box(-0.5, 0.5), "y_set": dpc.SoftBox(-0.4, 0.4, 3.0)},
@@ -83,7 +83,10 @@ def layer_of(case, **options):
 
 
 def cone_plan(layer, constraints, soft, u_ini, y_ini):
-    """The plan by Clarabel, at every tolerance it reaches: g eliminated by NumPy, the cost brought to 1/2 |x|^2, the sets in the words of cvxpy."""
+    """The plan by Clarabel, at every tolerance it reaches.
+
+    g is eliminated by NumPy, the cost brought to 1/2 |x|^2, and the sets are in the words of cvxpy.
+    """
     cp = pytest.importorskip("cvxpy", reason="cvxpy is an optional baseline")
     data = layer.data
     D = np.concatenate([m.numpy() for m in data.matrices])
@@ -313,7 +316,9 @@ def test_a_sweep_of_weights_is_one_call():
         assert relative(u, layer_of("ball", lambda_g=weight)(u_ini, y_ini, y_ref=Y_REF).u) < EXACT
 
 
-@pytest.mark.parametrize("how", [copy.deepcopy, lambda layer: pickle.loads(pickle.dumps(layer))], ids=["copy", "pickle"])
+@pytest.mark.parametrize(
+    "how", [copy.deepcopy, lambda layer: pickle.loads(pickle.dumps(layer))], ids=["copy", "pickle"]
+)
 def test_copies_answer_alike(how):
     layer, (u_ini, y_ini) = layer_of("product"), inputs()
     before = layer(u_ini, y_ini).u

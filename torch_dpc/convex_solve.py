@@ -92,9 +92,10 @@ class ConvexSolver:
         if shape:
             found = list(self._solve(theta))
         else:
-            one_each = self if self._G.ndim == 2 else replace(self, reduction=self.reduction.of_batch(batch))
+            shared = self._G.ndim == 2
+            solver = self if shared else replace(self, reduction=self.reduction.of_batch(batch))
             flat = theta.reshape(-1, theta.shape[-1])
-            chunks = [one_each._solve(part) for part in flat.split(CHUNK)] if self._G.ndim == 2 else [one_each._solve(flat)]
+            chunks = [solver._solve(part) for part in (flat.split(CHUNK) if shared else [flat])]
             found = [torch.cat(parts).reshape(*batch, parts[0].shape[-1]) for parts in zip(*chunks, strict=True)]
         report_failures(found[-1].reshape(-1, found[-1].shape[-1]), batch, self.on_failure)
         return tuple(found)
@@ -125,9 +126,7 @@ class ConvexSolver:
             self._mark_failures(theta, v0[..., order], found.gap, failed, out)
         return tuple(out)
 
-    def _mark_failures(
-        self, theta: Tensor, v0: Tensor, gap: Tensor, failed: Tensor, out: list[Tensor]
-    ) -> None:
+    def _mark_failures(self, theta: Tensor, v0: Tensor, gap: Tensor, failed: Tensor, out: list[Tensor]) -> None:
         """Look for certificates; leave nothing of a sample without a solution."""
         v, lam, weak, active, info = out
         unreachable = self.reduction.rows.unreachable(theta)

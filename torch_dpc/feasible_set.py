@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
@@ -201,7 +200,9 @@ class FeasibleSet:
             if not owner.separable:
                 columns = G[..., at].unflatten(-1, shape)  # (..., N, groups, size)
                 turned = torch.einsum("...ngs,...gst->...ngt", columns, W).flatten(-2)
-                G = torch.cat([x.expand(*turned.shape[:-1], -1) for x in (G[..., : at.start], turned, G[..., at.stop :])], -1)
+                G = torch.cat(
+                    [x.expand(*turned.shape[:-1], -1) for x in (G[..., : at.start], turned, G[..., at.stop :])], -1
+                )
         for (owner, at, shape), W in self._with(vectors):
             if not owner.separable:
                 rows = G[..., at, :].unflatten(-2, shape)  # (..., groups, size, N)
@@ -214,7 +215,7 @@ class FeasibleSet:
 
     @staticmethod
     def _scale(gamma: Tensor | float, at: slice, shape: tuple[int, ...]) -> Tensor | float:
-        """gamma of each group, `(..., groups, 1)`."""
+        """Return gamma of each group, `(..., groups, 1)`."""
         return gamma if isinstance(gamma, float) else gamma[..., at].unflatten(-1, shape)[..., :1]
 
     @staticmethod
@@ -226,5 +227,3 @@ def _joined(parts: list[Tensor]) -> Tensor:
     """Concatenate the last dimension, batch dimensions broadcast."""
     batch = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
     return torch.cat([part.expand(*batch, -1) for part in parts], dim=-1)
-
-

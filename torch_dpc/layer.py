@@ -102,9 +102,9 @@ class DPCLayer(nn.Module):
         self.data = data
         self.Q, self.R, self.lambda_g, self.lambda_s = Q, R, lambda_g, lambda_s
         self.lambda_u, self.R_du = lambda_u, R_du
-        self.u_set, self.y_set, self.du_set = (
-            _as_set(name, value) for name, value in (("u_set", u_set), ("y_set", y_set), ("du_set", du_set))
-        )
+        self.u_set: ConvexSet = _as_set("u_set", Reals() if u_set is None else u_set)
+        self.y_set: ConvexSet = _as_set("y_set", Reals() if y_set is None else y_set)
+        self.du_set: ConvexSet | None = None if du_set is None else _as_set("du_set", du_set)
         self.regularizer = regularizer
         self.terminal_steps = _checked_steps(terminal_steps, data.horizon)
         self.terms = Terms(
@@ -114,7 +114,7 @@ class DPCLayer(nn.Module):
             terminal_steps=self.terminal_steps,
         )
         if self.terms.slack and self.terms.rates:
-            raise ValueError("`R_du` and `du_set` count from the last of u_ini, which `lambda_u` leaves open: give one.")
+            raise ValueError("`R_du` and `du_set` count from the last u_ini, which `lambda_u` leaves open: give one.")
         self.backward_system = backward
         self.solver = solver
         self.on_failure = on_failure
@@ -140,14 +140,14 @@ class DPCLayer(nn.Module):
             data = self.data
             sets = [("u_set", self.u_set, data.n_u), ("y_set", self.y_set, data.n_y)]
             if self.terms.rates:
-                sets.append(("du_set", self.du_set, data.n_u))
-            stacked = FeasibleSet.of((name, Reals() if a is None else a, data.horizon, n) for name, a, n in sets)
+                sets.append(("du_set", self.du_set or Reals(), data.n_u))
+            stacked = FeasibleSet.of((name, owner, data.horizon, n) for name, owner, n in sets)
             self._sets = (owners, stacked)
         return self._sets[1]
 
     @property
     def reduced_kkt_size(self) -> int:
-        """Unknowns of the system that the reduced backward solves: horizon (n_u + n_y), and n_u more a step with rates."""
+        """Unknowns of the reduced backward's system: horizon (n_u + n_y), and horizon n_u more with changes of the input."""
         return self.sizes.v
 
     @property
@@ -331,9 +331,7 @@ def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
         raise ValueError(f"`{name}` must be one of {', '.join(map(repr, choices))}, got {value!r}.")
 
 
-def _as_set(name: str, value: Any) -> ConvexSet | None:
-    if value is None:
-        return None if name == "du_set" else Reals()
+def _as_set(name: str, value: Any) -> ConvexSet:
     if not isinstance(value, ConvexSet):
         raise ValueError(f"`{name}` must be a ConvexSet or None, got {type(value).__name__}.")
     return value

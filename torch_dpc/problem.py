@@ -87,8 +87,8 @@ def projector(data: HankelData) -> Tensor:
 def compact_form(data: HankelData, weights: Weights, theta: Tensor, terms: Terms = Terms()) -> CompactForm:  # noqa: B008
     """Return P, q, H, b as the paper writes them, with what the problem has beyond the paper's.
 
-    A slack on u_ini moves Up from H to P, a weight on changes of the input widens R, and terminal steps are more rows of
-    H. A set of the changes is no part of z in D: it has no compact form.
+    A slack on u_ini moves Up from H to P, a weight on changes of the input widens R, and terminal steps are more rows
+    of H. A set of the changes is no part of z in D: it has no compact form.
 
     Args:
         data: the recorded data.

@@ -186,7 +186,9 @@ class Implicit(torch.autograd.Function):
         return v0_bar, G_bar, -w, None, None, None, None, None, None
 
     @staticmethod
-    def jvp(ctx: Any, v0_t: Tensor | None, G_t: Tensor | None, projected_t: Tensor | None, *_: Any) -> tuple[Tensor, Tensor]:
+    def jvp(
+        ctx: Any, v0_t: Tensor | None, G_t: Tensor | None, projected_t: Tensor | None, *_: Any
+    ) -> tuple[Tensor, Tensor]:
         v, lam, G, solved, weak = ctx.saved_tensors
         blocks = Implicit._blocks(ctx, v, lam, solved, weak)
         free = torch.zeros_like(lam) if v0_t is None else v0_t

@@ -32,6 +32,8 @@ from .weights import Weights, psd_root
 
 #: Singular values of E at or below this fraction of the largest make the optimum a set.
 COST_RANK_TOLERANCE = 1e-14
+#: A row of C whose part in the kernel of the equalities is at most this fraction of it is decided by them.
+DECIDED = 1e-12
 #: Weight on the kernel of E, relative to the largest singular value of E. Its square, 1e-12, is how far from the
 #: optimum (in relative cost curvature) the selected solution may be.
 TIE_BREAK = 1e-6
@@ -105,7 +107,11 @@ def reduce(rows: DataRows, weights: Weights) -> Reduction:
     with torch.no_grad():
         E, f = _least_squares(rows, weights)
         T, Qe, is_selection = _factor(E)
-        Ct = torch.linalg.solve_triangular(T, rows.C @ rows.Z, upper=True, left=False)
+        CZ = rows.C @ rows.Z
+        # A row that the equalities decide is zero here; its rounding would stand for a motion that does not exist.
+        decided = CZ.norm(dim=-1) <= DECIDED * rows.C.norm(dim=-1)
+        CZ = torch.where(decided[:, None], 0.0, CZ)
+        Ct = torch.linalg.solve_triangular(T, CZ, upper=True, left=False)
         X_theta = torch.linalg.solve_triangular(T, Qe.mT @ f, upper=True)
         # One step of refinement: it matters where weights of zero leave E a condition of 1e10.
         X_theta = X_theta + torch.linalg.solve_triangular(T, Qe.mT @ (f - E @ X_theta), upper=True)
@@ -197,7 +203,7 @@ def _with_graph(rows: DataRows, weights: Weights, T: Tensor, A_theta: Tensor, A_
 
 
 def _gram_of_charged(rows: DataRows) -> Tensor:
-    """M'M = M = I - W^+ W in the coordinates a (or I), with its derivative at constant rank of W where W has a graph."""
+    """M = I - W^+ W in the coordinates a (or I), with its derivative at constant rank of W where W has a graph."""
     N = _charged(rows)
     M = N.mT @ N
     W = torch.cat([rows.Up, rows.Yp, rows.Uf])

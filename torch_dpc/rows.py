@@ -5,8 +5,8 @@ With g = B a (:mod:`torch_dpc.rowspace`) the problem reads
     minimise over a   1/2 |v - v_ref|_W^2 + lambda_g |N a|^2 + sum over past rows of lambda |S a - s|^2
     subject to        Eq a = e,   v = C a in the product of the sets,
 
-with v = (u, y), and the changes of the input after them where the problem speaks of those. v_ref, s and e are entries of
-theta = (u_ini, y_ini, u_ref, y_ref). What each of the problem's terms adds is told here, and only here.
+with v = (u, y), and the changes of the input after them where the problem speaks of those. v_ref, s and e are entries
+of theta = (u_ini, y_ini, u_ref, y_ref). What each of the problem's terms adds is told here, and only here.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
@@ -60,7 +60,7 @@ class ConvexSet(nn.Module):
 
     def jacobian(self, x: Tensor, gamma: Any = 1.0) -> Tensor:
         """Return D1, the Jacobian of the projection (of `prox`) at x, `(..., n, n)`; it is symmetric."""
-        value, product = torch.func.vjp(lambda x: self.prox(x, gamma), x)
+        value, product, *_ = torch.func.vjp(lambda x: self.prox(x, gamma), x)
         rows = []
         for i in range(x.shape[-1]):
             unit = torch.zeros_like(value)
@@ -454,18 +454,19 @@ class Product(ConvexSet):
         if channels != self.n:
             raise ValueError(f"the product has {self.n} channels, the plan {channels}.")
         places = torch.arange(steps * channels).reshape(steps, channels)
-        found = []
-        for owner, own in zip(self.factors, self.channels, strict=True):
+        found: list[Part] = []
+        for owner, own in self._pairs():
             of_own = places[:, own].reshape(-1)
             found += [(leaf, of_own[inner]) for leaf, inner in owner.parts(steps, len(own))]
         return found
 
+    def _pairs(self) -> list[Part]:
+        return [(cast(ConvexSet, s), torch.tensor(own)) for s, own in zip(self.factors, self.channels, strict=True)]
+
     def _each(self, method: str, *xs: Tensor) -> Tensor:
         """Apply a method of every factor to its entries of xs, and put the results together."""
-        if self.per == "step":
-            pairs = [(owner, torch.tensor(own)) for owner, own in zip(self.factors, self.channels, strict=True)]
-        else:
-            pairs = self.parts(xs[0].shape[-1] // self.n, self.n)
+        steps = xs[0].shape[-1] // self.n
+        pairs = self._pairs() if self.per == "step" else self.parts(steps, self.n)
         out = torch.zeros_like(xs[0])
         for owner, places in pairs:
             out[..., places] = getattr(owner, method)(*(x[..., places] for x in xs))
