@@ -126,6 +126,19 @@ class ConvexSolver:
             self._mark_failures(theta, v0[..., order], found.gap, failed, out)
         return tuple(out)
 
+    def _weak(self, v: Tensor, lam: Tensor) -> Tensor:
+        """Return the rows whose multiplier moves nothing: they count as inactive, as at a box; in part order."""
+        moved = (lam * self._G.diagonal(dim1=-2, dim2=-1)).abs()
+        return self.sets.weak(v, moved <= WEAKLY_ACTIVE * (1 + v.abs()))
+
+    def independent(self, theta: Tensor, planned: Planned) -> Tensor:
+        """Return whether the directions that the sets hold are independent, `(*batch,)`."""
+        sets, order = self.sets, self.sets.order.to(theta.device)
+        lam = planned.lam[..., order]
+        v = self._optimality.unconstrained(theta)[1][..., order] - times(self._G, lam)
+        blocks = sets.freed(sets.jacobians(v + self.gamma * lam, self.gamma), self._weak(v, lam))
+        return solve_system(self._G, sets, blocks, torch.zeros_like(lam), self.gamma)[1]
+
     def _mark_failures(self, theta: Tensor, v0: Tensor, gap: Tensor, failed: Tensor, out: list[Tensor]) -> None:
         """Look for certificates; leave nothing of a sample without a solution."""
         v, lam, weak, active, info = out
@@ -162,9 +175,3 @@ class _Find(torch.autograd.Function):
         (theta,) = lead_all((args[0],), (in_dims[0],), (1,), info.batch_size)
         outputs = _Find.apply(theta, args[1])
         return outputs, (0,) * len(outputs)
-
-
-def is_nonsingular(G: Tensor, sets: FeasibleSet, x: Tensor, weak: Tensor, gamma: Tensor) -> Tensor:
-    """Return whether the projected system at a solution is nonsingular, `(...)`."""
-    blocks = sets.freed(sets.jacobians(x, gamma), weak)
-    return solve_system(G, sets, blocks, torch.zeros_like(x), gamma)[1]

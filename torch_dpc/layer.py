@@ -140,14 +140,14 @@ class DPCLayer(nn.Module):
             data = self.data
             sets = [("u_set", self.u_set, data.n_u), ("y_set", self.y_set, data.n_y)]
             if self.terms.rates:
-                sets.append(("du_set", self.du_set or Reals(), data.n_u))
+                sets.append(("du_set", Reals() if self.du_set is None else self.du_set, data.n_u))
             stacked = FeasibleSet.of((name, owner, data.horizon, n) for name, owner, n in sets)
             self._sets = (owners, stacked)
         return self._sets[1]
 
     @property
     def reduced_kkt_size(self) -> int:
-        """Unknowns of the reduced backward's system: horizon (n_u + n_y), and horizon n_u more with changes of the input."""
+        """Unknowns of the reduced system: horizon (n_u + n_y), and horizon n_u more where changes of the input count."""
         return self.sizes.v
 
     @property
@@ -180,7 +180,7 @@ class DPCLayer(nn.Module):
             return self.plan(theta, *self.bounds(theta.device), dtype=dtype, on_failure=on_failure)
         reduction, solver = self._factors(theta.device)
         planned = _with_failures(solver, on_failure).plan(theta, reduction)
-        return self._solution(planned, theta, reduction, dtype)
+        return self._solution(planned, theta, reduction, solver, dtype)
 
     def plan(
         self,
@@ -201,14 +201,16 @@ class DPCLayer(nn.Module):
         """
         reduction, solver = self._factors(theta.device)
         planned = solve_reduced(_with_failures(solver, on_failure), theta, reduction, lower, upper)
-        return self._solution(planned, theta, reduction, dtype)
+        return self._solution(planned, theta, reduction, solver, dtype)
 
-    def _solution(self, planned: Planned, theta: Tensor, reduction: Reduction, dtype: torch.dtype) -> DPCSolution:
+    def _solution(
+        self, planned: Planned, theta: Tensor, reduction: Reduction, solver: Any, dtype: torch.dtype
+    ) -> DPCSolution:
         u, y, lam, _, info = planned
         return DPCSolution(
             u=u if dtype == torch.float64 else u.to(dtype),
             y=y if dtype == torch.float64 else y.to(dtype),
-            info=SolveInfo(info, reduction.is_selection),
+            info=SolveInfo(info, reduction.is_selection, lambda: self._nonsingular(solver, theta, planned)),
             lam=lam,
             _make_g=lambda: self._g(reduction, theta, lam, info).to(dtype),
         )
@@ -314,6 +316,14 @@ class DPCLayer(nn.Module):
     def __getstate__(self) -> dict[str, Any]:
         """Leave the factors out of copies and pickles: they are made again when needed."""
         return {**self.__dict__, "_cache": {}, "_sets": None}
+
+    def _nonsingular(self, solver: Any, theta: Tensor, planned: Planned) -> Tensor:
+        reduction, space = solver.reduction, self.data.row_space
+        # The part of g that the data do not see is fixed by lambda_g alone.
+        fixed = (reduction.weights.lambda_g > 0) | (space.rank == self.data.n_g)
+        decided = reduction.rows.Eq_range is None and not reduction.is_selection
+        with torch.no_grad():
+            return solver.independent(theta.detach(), planned) & fixed & decided
 
     def _g(self, reduction: Reduction, theta: Tensor, lam: Tensor, info: Tensor) -> Tensor:
         a = times(reduction.A_theta, theta) - times(reduction.A_lam, lam)

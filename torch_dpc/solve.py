@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .active_set import solve_active
 from .checks import as_data, is_finite
 from .dual_active_set import SOLVED_FLAG, Daqp, sense_of, solve_daqp
 from .errors import InfeasibleError, SolveError, Status
@@ -129,6 +130,14 @@ class Solver:
         report_failures(solved.info, batch, self.on_failure)
         v, *rest = (x.reshape(*batch, x.shape[-1]) for x in solved)
         return Planned(*self.sizes.split(v), *rest)
+
+    def independent(self, theta: Tensor, planned: Planned) -> Tensor:
+        """Return whether the rows held at a bound are independent, `(*batch,)`."""
+        batch, _, (active,) = flatten_batch((self.reduction.G,), (planned.active,))
+        one_each = self.reduction.of_batch(batch)
+        return solve_active(one_each.G, one_each.Ct, active, torch.zeros_like(active, dtype=torch.float64))[1].reshape(
+            batch
+        )
 
     def _solve(self, theta: Tensor, lower: Tensor, upper: Tensor, daqp_first: bool) -> Solved:
         """Run the first engine on the batch, the second on what it left."""
