@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from typing import Any
 
 import torch
@@ -18,6 +19,7 @@ from .problem import CompactForm, Sizes, compact_form
 from .projected_kkt import FullSystem
 from .reduction import Reduction, reduce
 from .rows import DataRows, Terms
+from .saving import load_layer, save_layer
 from .sets import ConvexSet, Reals
 from .solution import DPCSolution, SolveInfo
 from .solve import Planned, Solver
@@ -228,6 +230,52 @@ class DPCLayer(nn.Module):
             raise ValueError("`compact_form` has no rows for changes of the input; leave out `du_set`.")
         return compact_form(self.data, weights, theta, self.terms)
 
+    def config(self) -> dict[str, Any]:
+        """Return the arguments of the constructor beyond the data, as they are now."""
+        return {
+            "Q": self.Q,
+            "R": self.R,
+            "lambda_g": self.lambda_g,
+            "lambda_s": self.lambda_s,
+            "u_set": self.u_set,
+            "y_set": self.y_set,
+            "du_set": self.du_set,
+            "R_du": self.R_du,
+            "lambda_u": self.lambda_u,
+            "regularizer": self.regularizer,
+            "terminal_steps": self.terminal_steps,
+            "backward": self.backward_system,
+            "solver": self.solver,
+            "on_failure": self.on_failure,
+        }
+
+    def save(self, path: str | os.PathLike[str], *, data: bool = False) -> None:
+        """Write the layer to a safetensors file: weights, sets, settings and the data, without pickle.
+
+        Parameters, tensors and numbers come back as what they are; of a tensor that a graph made, its value is kept.
+
+        Args:
+            path: of the file, which is replaced.
+            data: write the recorded windows, for `sol.g`. Otherwise the data are written compact: the file is small
+                whatever the number of windows, plans are the same, and `sol.g` raises.
+
+        Raises:
+            ValueError: a set that is not known (:func:`torch_dpc.register_set`); windows asked of compact data.
+            ImportError: safetensors is missing.
+        """
+        save_layer(self, path, data=data)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> DPCLayer:
+        """Return the layer that :meth:`save` wrote, on the CPU.
+
+        Raises:
+            ValueError: a damaged file, another version of the format, or a set that is not known.
+            ImportError: safetensors is missing.
+        """
+        layer: DPCLayer = load_layer(cls, path)
+        return layer
+
     def extra_repr(self) -> str:
         """Describe the data and the sizes of the systems that are solved."""
         return (
@@ -326,6 +374,7 @@ class DPCLayer(nn.Module):
             return solver.independent(theta.detach(), planned) & fixed & decided
 
     def _g(self, reduction: Reduction, theta: Tensor, lam: Tensor, info: Tensor) -> Tensor:
+        self.data.require_windows()
         a = times(reduction.A_theta, theta) - times(reduction.A_lam, lam)
         basis = self.data.row_space.basis.to(a.device)
         if reduction.rows.C.requires_grad:  # g = D^+ (D g), so that the data behind D are differentiated too
