@@ -48,21 +48,17 @@ def as_recordings(u: Any, y: Any) -> tuple[list[Tensor], list[Tensor]]:
     return [a.to(common) for a in u_list], [b.to(common) for b in y_list]
 
 
-def as_recording(name: str, value: Any) -> Tensor:
-    """Return one signal as a tensor `(T, n)`; a graph is kept."""
-    tensor = as_data(name, value)
-    if tensor.ndim != 2 or tensor.shape[1] == 0:
-        raise ValueError(
-            f"`{name}` must have shape (T, n), time first, or be a list of such, got {tuple(tensor.shape)}."
-        )
-    return tensor
-
-
 def _listed(name: str, value: Any) -> list[Tensor]:
     many = isinstance(value, Sequence) and len(value) > 0 and all(getattr(v, "ndim", 0) == 2 for v in value)
     if isinstance(value, Sequence) and not many and _depth(value) == 3:
         many = True
-    return [as_recording(f"{name}[{i}]", v) for i, v in enumerate(value)] if many else [as_recording(name, value)]
+    items = [as_data(f"{name}[{i}]", v) for i, v in enumerate(value)] if many else [as_data(name, value)]
+    for item in items:
+        if item.ndim != 2 or item.shape[1] == 0:
+            raise ValueError(
+                f"`{name}` must have shape (T, n), time first, or be a list of such, got {tuple(item.shape)}."
+            )
+    return items
 
 
 def _depth(value: Any) -> int:

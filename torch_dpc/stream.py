@@ -16,10 +16,9 @@ import torch
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from .checks import check_count
+from .checks import as_data, check_count
 from .excitation import has_full_row_rank
 from .hankel import HankelData
-from .recordings import as_recording
 from .rowspace import relative_tolerance
 
 #: Windows folded at once. 256 and more cost the same a window; the memory grows with them.
@@ -207,7 +206,7 @@ class HankelStream:
 
     def _checked(self, u: Any, y: Any) -> NDArray[np.float64]:
         """Return (u, y) as one array `(T, n_u + n_y)`."""
-        pair = [as_recording(name, _two_dimensional(value)).detach() for name, value in (("u", u), ("y", y))]
+        pair = [_as_samples("u", u), _as_samples("y", y)]
         steps, channels = zip(*(signal.shape for signal in pair), strict=True)
         if steps[0] != steps[1]:
             raise ValueError(f"`u` and `y` must be as long, got {steps[0]} and {steps[1]} samples.")
@@ -256,8 +255,13 @@ class HankelStream:
         self._data = None
 
 
-def _two_dimensional(value: Any) -> Any:
-    """Return one sample `(n,)` as a recording of one, `(1, n)`."""
-    if isinstance(value, (torch.Tensor, np.ndarray)):
-        return value[None] if value.ndim == 1 else value
-    return value
+def _as_samples(name: str, value: Any) -> torch.Tensor:
+    """Return samples as a recording `(T, n)`; one sample may be `(n,)`."""
+    tensor = as_data(name, value).detach()
+    if tensor.ndim == 1:
+        tensor = tensor[None]
+    if tensor.ndim != 2 or tensor.shape[1] == 0:
+        raise ValueError(
+            f"`{name}` must have shape (T, n), time first, or (n,) for one sample, got {tuple(tensor.shape)}."
+        )
+    return tensor
