@@ -235,7 +235,10 @@ def test_data_are_snapshots():
     stream.append(u[60:], y[60:])
     after = stream.data
     assert torch.equal(stacked(before), kept) and not torch.equal(stacked(after), kept)
-    stream.new_recording()
+    stream.append(u[:1], y[:1])
+    stream.new_recording()  # folds what waits
+    assert stream.data is not after
+    after = stream.data
     stream.append(u[:7], y[:7])  # no window yet: nothing new
     assert stream.data is after
 
