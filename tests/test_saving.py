@@ -11,6 +11,7 @@ import torch
 
 import torch_dpc as dpc
 from helpers import HOLDING, PAPER, SMALL, Y_REF, masses_data, paper_layer, randn, small_data, small_layer, windows
+from torch_dpc.registry import known_sets
 
 safetensors = pytest.importorskip("safetensors.torch", reason="saving needs safetensors")
 
@@ -153,6 +154,31 @@ def test_a_file_does_not_grow_with_the_number_of_windows(tmp_path):
 
 
 # --- sets -------------------------------------------------------------------------------------------------------------
+
+
+#: One of each set of the package, with every argument given.
+PACKAGE_SETS = {
+    "Box": lambda: dpc.Box(-0.5, torch.nn.Parameter(torch.tensor([0.5, 1.0]))),
+    "Reals": lambda: dpc.Reals(),
+    "NonNegative": lambda: dpc.NonNegative(),
+    "SoftBox": lambda: dpc.SoftBox(-0.5, torch.tensor([0.5, 1.0]), weight=torch.nn.Parameter(torch.tensor(30.0))),
+    "Ball": lambda: dpc.Ball(torch.nn.Parameter(torch.tensor(0.6)), torch.tensor([0.1, 0.0]), per="trajectory"),
+    "SecondOrderCone": lambda: dpc.SecondOrderCone(per="trajectory"),
+    "Product": lambda: dpc.Product([(dpc.NonNegative(), 1), (dpc.Box(-0.5, torch.tensor(0.5)), [0])]),
+}
+
+
+@pytest.mark.parametrize(
+    "name", sorted(name for name, cls in known_sets().items() if cls.__module__.startswith("torch_dpc."))
+)
+def test_sets_of_the_package(name, tmp_path):
+    layer = small_layer(u_set=PACKAGE_SETS[name]())
+    back = saved(layer, tmp_path)
+    assert type(back.u_set) is type(layer.u_set)
+    assert [n for n, _ in back.named_parameters()] == [n for n, _ in layer.named_parameters()]
+    x = 2 * randn(7, 2)
+    assert torch.equal(back.u_set.project(x), layer.u_set.project(x))
+    assert torch.equal(plan(back).u, plan(layer).u)
 
 
 class Tube(dpc.Box):

@@ -62,16 +62,21 @@ def known_sets() -> dict[str, type[ConvexSet]]:
 
 
 def arguments_of(thing: Any) -> dict[str, Any]:
-    """Return the arguments that make an object again: its `config()`, or its attributes named as its parameters."""
-    if hasattr(thing, "config"):
+    """Return the arguments that make an object again: its `config()`, or its attributes named as its parameters.
+
+    A `config()` from further up than `__init__` speaks of another constructor, and does not count.
+    """
+    cls = type(thing)
+    owner = {name: next((c for c in cls.__mro__ if name in vars(c)), object) for name in ("config", "__init__")}
+    if owner["config"] not in (object, ConvexSet) and issubclass(owner["config"], owner["__init__"]):
         return dict(thing.config())
-    if type(thing).__init__ is nn.Module.__init__:  # a set without arguments
+    if owner["__init__"] is nn.Module:  # a set without arguments
         return {}
-    names = [name for name in inspect.signature(type(thing).__init__).parameters if name != "self"]
+    names = [name for name in inspect.signature(cls.__init__).parameters if name != "self"]
     missing = [name for name in names if not hasattr(thing, name)]
     if missing:
         raise ValueError(
-            f"{type(thing).__name__} cannot be saved: it has no attribute {missing[0]!r} to go with the parameter of "
+            f"{cls.__name__} cannot be saved: it has no attribute {missing[0]!r} to go with the parameter of "
             f"its constructor. Keep the argument under that name, or define `config()`, which returns the arguments."
         )
     return {name: getattr(thing, name) for name in names}
