@@ -162,7 +162,7 @@ PACKAGE_SETS = {
     "Reals": lambda: dpc.Reals(),
     "NonNegative": lambda: dpc.NonNegative(),
     "SoftBox": lambda: dpc.SoftBox(-0.5, torch.tensor([0.5, 1.0]), weight=torch.nn.Parameter(torch.tensor(30.0))),
-    "Ball": lambda: dpc.Ball(torch.nn.Parameter(torch.tensor(0.6)), torch.tensor([0.1, 0.0]), per="trajectory"),
+    "Ball": lambda: dpc.Ball(torch.nn.Parameter(torch.tensor(0.6)), torch.full((6, 2), 0.1), per="trajectory"),
     "SecondOrderCone": lambda: dpc.SecondOrderCone(per="trajectory"),
     "Product": lambda: dpc.Product([(dpc.NonNegative(), 1), (dpc.Box(-0.5, torch.tensor(0.5)), [0])]),
 }
@@ -176,7 +176,7 @@ def test_sets_of_the_package(name, tmp_path):
     back = saved(layer, tmp_path)
     assert type(back.u_set) is type(layer.u_set)
     assert [n for n, _ in back.named_parameters()] == [n for n, _ in layer.named_parameters()]
-    x = 2 * randn(7, 2)
+    x = 2 * randn(7, 12 if getattr(layer.u_set, "per", "step") == "trajectory" else 2)
     assert torch.equal(back.u_set.project(x), layer.u_set.project(x))
     assert torch.equal(plan(back).u, plan(layer).u)
 
