@@ -1,6 +1,6 @@
 """Study: streams of any length in constant memory, online updates, and files of saved layers.
 
-    python scripts/study_stream.py             # about 3 minutes on one core, 10 million samples included
+    python scripts/study_stream.py             # about 2 minutes on one core, 10 million samples included
     python scripts/study_stream.py --quick     # about 30 s: a hundredth of the samples
 
 Every stream is one ongoing recording of a linear plant with noise, simulated chunk by chunk, in a process of its own.
@@ -155,6 +155,12 @@ def adaptation(forgetting: float) -> dict[str, float]:
     return {f"error {k}": error for k, error in enumerate(track(forgetting))}
 
 
+def in_a_process(function: Callable[..., dict[str, float]], given: tuple[Any, ...]) -> dict[str, float]:
+    """Return the function's result from a process of its own, so that its peak memory is its own."""
+    with ProcessPoolExecutor(1, multiprocessing.get_context("spawn")) as pool:
+        return pool.submit(function, *given).result()
+
+
 def _timed(times: list[float], function: Callable[[], Any]) -> Any:
     began = time.perf_counter()
     result = function()
@@ -219,12 +225,10 @@ def main(argv: list[str] | None = None) -> None:
     else:
         path.write_text("part,arguments,quantity,value\n")
     wanted = [(function, given, (function.__name__, json.dumps(given))) for function, given in jobs(args.quick)]
-    context = multiprocessing.get_context("spawn")
     for function, given, key in tqdm(wanted, desc="Stream study", unit="row"):
         if key in done:
             continue
-        with ProcessPoolExecutor(1, context) as pool:  # a process each: its peak memory is its own
-            done[key] = pool.submit(function, *given).result()
+        done[key] = in_a_process(function, given)
         with path.open("a", newline="") as file:
             csv.writer(file).writerows([*key, quantity, repr(value)] for quantity, value in done[key].items())
     chosen = {key: done[key] for _, _, key in wanted}
