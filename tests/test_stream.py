@@ -1,5 +1,6 @@
 """Data from streams: the same plans as from whole recordings, in constant memory, with and without forgetting."""
 
+import pickle
 import time
 import tracemalloc
 import warnings
@@ -241,6 +242,18 @@ def test_data_are_snapshots():
     after = stream.data
     stream.append(u[:7], y[:7])  # no window yet: nothing new
     assert stream.data is after
+
+
+def test_a_stream_survives_a_pickle():
+    u, y = randn(90, 2), randn(90, 3, seed=1)
+    stream = dpc.HankelStream(**SIZES, forgetting=0.9)
+    stream.append(u[:50], y[:50])
+    stream.data  # noqa: B018  some windows folded, some samples waiting
+    stream.append(u[50:55], y[50:55])
+    again = pickle.loads(pickle.dumps(stream))
+    for held in (stream, again):
+        held.append(u[55:], y[55:])
+    assert again.n_windows == 83 and torch.equal(stacked(again.data), stacked(stream.data))
 
 
 def test_a_layer_takes_new_data():

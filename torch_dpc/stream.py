@@ -54,10 +54,6 @@ class HankelStream:
         horizon: steps that are planned.
         forgetting: f, in (0, 1].
 
-    Attributes:
-        n_windows: windows seen so far.
-        n_effective: the sum of their weights.
-
     Example:
         >>> stream = HankelStream(t_ini=2, horizon=5, forgetting=0.99)
         >>> source = torch.Generator().manual_seed(0)
