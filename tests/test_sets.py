@@ -26,6 +26,7 @@ SETS = {
 }
 WHOLE = {
     "ball": dpc.Ball(1.0, torch.full((STEPS, CHANNELS), 0.1), per="trajectory"),
+    "ball around one step's center": dpc.Ball(1.0, torch.tensor([0.1, 0.2, 0.3]), per="trajectory"),
     "cone": dpc.SecondOrderCone(per="trajectory"),
     "product": dpc.Product([(dpc.Ball(0.5, per="trajectory"), [0, 2]), (dpc.Box(-0.1, torch.rand(STEPS, 1)), [1])]),
 }

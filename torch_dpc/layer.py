@@ -344,8 +344,14 @@ class DPCLayer(nn.Module):
                 entry = self._cache[key] = (kept, make(*args))
         return entry[1]
 
+    def _rows(self, device: torch.device) -> DataRows:
+        """Return the rows of the data; weights that learn leave them alone."""
+        if carries_derivative(self.data.matrices):
+            return DataRows.of(self.data, device, self.terms)
+        return self._cached(("rows", device), (self.data,), DataRows.of, self.data, device, self.terms)
+
     def _factor(self, device: torch.device) -> tuple[Reduction, Solver | ConvexSolver]:
-        reduction = reduce(DataRows.of(self.data, device, self.terms), self._weights(device))
+        reduction = reduce(self._rows(device), self._weights(device))
         detached = reduction.detach()
         if not self.feasible_set.is_box:
             return reduction, ConvexSolver(detached, self.sizes, self.feasible_set, self.on_failure)

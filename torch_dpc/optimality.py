@@ -122,7 +122,7 @@ class Optimality:
             (term.rows, None if weight is None else array(weight), _reference_of(term)) for term, weight in tracking
         ]
         self._size_Eq = float(rows.Eq.norm())
-        largest = max(float(torch.linalg.matrix_norm(w, ord=2).max()) for _, w in tracking if w is not None)
+        largest = max(float(w.abs().sum(-1).max()) for _, w in tracking if w is not None)  # bounds the norm
         self._floor = CANCELLATION * largest * float(rows.C.norm())
         self._rounding = ROUNDING * sum(
             float(getattr(weights, fit.weight).max()) * float(fit.rows.norm()) ** 2 for fit in rows.fits

@@ -27,13 +27,12 @@ class Saddle:
     Z: Tensor
     Eq_pinv: Tensor
 
-    def solve(self, Psi: Tensor, top: Tensor, bottom: Tensor) -> tuple[Tensor, Tensor]:
-        """Return a and mu for right-hand sides `(..., r, k)` and `(..., n_eq, k)`."""
+    def solve(self, Psi: Tensor, top: Tensor, bottom: Tensor) -> Tensor:
+        """Return a for right-hand sides `(..., r, k)` and `(..., n_eq, k)`."""
         particular = self.Eq_pinv @ bottom
         rhs = self.Z.mT @ (top - Psi @ particular)
         x = torch.linalg.solve_triangular(self.T.mT, rhs, upper=False)
-        a = particular + self.Z @ torch.linalg.solve_triangular(self.T, x, upper=True)
-        return a, self.multipliers(Psi, top, a)
+        return particular + self.Z @ torch.linalg.solve_triangular(self.T, x, upper=True)
 
     def multipliers(self, Psi: Tensor, top: Tensor, a: Tensor) -> Tensor:
         """Return mu with Eq' mu = top - Psi a (least squares)."""
@@ -42,7 +41,8 @@ class Saddle:
 
 def known_solution(Psi: Tensor, Eq: Tensor, top: Tensor, bottom: Tensor, a: Tensor, saddle: Saddle) -> Tensor:
     """Return the solution `a`, computed elsewhere to full precision, with the derivative of the solve attached."""
-    mu = saddle.multipliers(Psi.detach(), top.detach(), a)
+    # mu is seen by the cotangent of Eq alone, and costs as much as the rest.
+    mu = saddle.multipliers(Psi.detach(), top.detach(), a) if Eq.requires_grad else torch.zeros_like(bottom)
     solved, _ = _SaddleSolve.apply(Psi, Eq, top, bottom, a, mu, saddle)
     return solved
 
@@ -66,10 +66,12 @@ class _SaddleSolve(torch.autograd.Function):
         Psi, Eq, a, mu, T, Z, Eq_pinv = ctx.saved_tensors
         saddle = Saddle(T, Z, Eq_pinv)
         a_bar, mu_bar = cotangents
+        moves = ctx.needs_input_grad[1] or ctx.needs_input_grad[3]
         with torch.no_grad():
-            s, t = saddle.solve(Psi, a_bar, mu_bar)
+            s = saddle.solve(Psi, a_bar, mu_bar)
+            t = saddle.multipliers(Psi, a_bar, s) if moves else torch.zeros_like(mu_bar)
         if torch.is_grad_enabled():
             s, t = _SaddleSolve.apply(Psi, Eq, a_bar, mu_bar, s, t, saddle)
         Psi_bar = -s @ a.mT
-        Eq_bar = -(mu @ s.mT + t @ a.mT)
-        return Psi_bar.sum_to_size(Psi.shape), Eq_bar.sum_to_size(Eq.shape), s, t, None, None, None
+        Eq_bar = -(mu @ s.mT + t @ a.mT).sum_to_size(Eq.shape) if moves else None
+        return Psi_bar.sum_to_size(Psi.shape), Eq_bar, s, t if moves else None, None, None, None

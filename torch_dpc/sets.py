@@ -332,8 +332,10 @@ class Ball(ConvexSet):
     def _polar(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return center, direction, distance and radius; the direction is 0 at the center."""
         center = _as_tensor(self.center).to(x)
-        if self.per == "trajectory" and center.ndim > 1:
-            center = center.flatten(-2)
+        if self.per == "trajectory":
+            center = center.flatten(-2) if center.ndim > 1 else center
+            if center.ndim == 1 and x.shape[-1] % len(center) == 0:
+                center = center.repeat(x.shape[-1] // len(center))  # one step's, for all
         away = x - center
         # Twice `where`: at the center the norm has no derivative, and NaN must not leak into that of the others.
         at_center = (away == 0).all(-1, keepdim=True)
