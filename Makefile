@@ -56,7 +56,7 @@ $(ENV): setup.cfg constraints.txt
 	@echo "[1/4] PyTorch ..."
 	@$(PIP) setuptools torch
 	@echo "[2/4] torch_dpc, test tools, plotting ..."
-	@$(PIP) -e '.[scripts,dev]'
+	@$(PIP) -e '.[scripts,dev,save]'
 	@echo "[3/4] quadrotor simulator ..."
 	@$(PIP) -e '.[quadrotor]' || $(call without,the quadrotor)
 	@echo "[4/4] baselines ..."

@@ -10,8 +10,10 @@ from torch import Tensor
 
 from torch_dpc import Box, DPCLayer
 from torch_dpc.checks import is_finite
-from torch_dpc.problem import Sizes, penalty, projector, weight_matrix
-from torch_dpc.reduction import Reduction, psd_root
+from torch_dpc.problem import Sizes, projector
+from torch_dpc.reduction import Reduction
+from torch_dpc.rows import Terms
+from torch_dpc.weights import penalty, psd_root, weight_matrix
 
 #: Keeps 0 / 0 at 0.
 _TINY = 1e-300
@@ -37,8 +39,10 @@ def bounds_of(layer: DPCLayer) -> tuple[Tensor, Tensor]:
     """Return the bounds of v = (u, y) on the CPU, `(N,)`.
 
     Raises:
-        ValueError: a set is no box.
+        ValueError: a set is no box, or the problem is not the paper's.
     """
+    if layer.terms != Terms():
+        raise ValueError(f"the baselines take the paper's problem, got one with {layer.terms}.")
     if not (isinstance(layer.u_set, Box) and isinstance(layer.y_set, Box)):
         names = f"{type(layer.u_set).__name__} and {type(layer.y_set).__name__}"
         raise ValueError(f"the baselines take boxes as `u_set` and `y_set`, got {names}.")

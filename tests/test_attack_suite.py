@@ -1,5 +1,6 @@
 """The attacks of several steps: never worse than Algorithm 1, right where the answer is known, and their edges."""
 
+import copy
 import dataclasses
 import functools
 import math
@@ -240,7 +241,8 @@ class Fragile(Watched):
         lost = torch.linalg.vector_norm(y_ini, dim=(-2, -1)) > self.limit
         table = sol.info.table.clone()
         table[lost, 0] = dpc.Status.FAILED
-        info = type(sol.info)(table, sol.info.is_selection)
+        info = copy.copy(sol.info)
+        info.table = table
         return dataclasses.replace(sol, u=torch.where(lost[:, None, None], torch.nan, sol.u), info=info)
 
 

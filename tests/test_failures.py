@@ -216,7 +216,7 @@ SKEW = torch.eye(4) + torch.triu(torch.ones(4, 4), 1)
         ({"lambda_g": -1.0}, "`lambda_g` must not be negative, got -1"),
         ({"lambda_s": torch.inf}, "`lambda_s` must be finite"),
         ({"lambda_s": torch.tensor(3)}, "`lambda_s` must hold floating-point numbers"),
-        ({"u_set": (-1.0, 1.0)}, "`u_set` must be a Box, Reals or None, got tuple"),
+        ({"u_set": (-1.0, 1.0)}, "`u_set` must be a ConvexSet or None, got tuple"),
         ({"y_set": dpc.Box(torch.zeros(3), 1.0)}, r"bounds of `y_set` .*got \(3,\)"),
         ({"solver": "osqp"}, "`solver` must be one of .* got 'osqp'"),
         ({"backward": "none"}, "`backward` must be one of 'reduced', 'full', got 'none'"),

@@ -6,13 +6,16 @@ from .errors import ExcitationWarning, InfeasibleError, SolveError, Status
 from .hankel import HankelData, excitation_order, hankel
 from .layer import DPCLayer
 from .problem import CompactForm
-from .sets import Box, ConvexSet, Reals
+from .saving import register_set
+from .sets import Ball, Box, ConvexSet, NonNegative, Product, Reals, SecondOrderCone, SoftBox
 from .simulation import ClosedLoopLog, Plant, collect, simulate
 from .solution import DPCSolution, SolveInfo
+from .stream import HankelStream
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "Ball",
     "Box",
     "ClosedLoopLog",
     "CompactForm",
@@ -22,9 +25,14 @@ __all__ = [
     "DPCSolution",
     "ExcitationWarning",
     "HankelData",
+    "HankelStream",
     "InfeasibleError",
+    "NonNegative",
     "Plant",
+    "Product",
     "Reals",
+    "SecondOrderCone",
+    "SoftBox",
     "SolveError",
     "SolveInfo",
     "Status",
@@ -32,6 +40,7 @@ __all__ = [
     "collect",
     "excitation_order",
     "hankel",
+    "register_set",
     "simulate",
     "systems",
 ]

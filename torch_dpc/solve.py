@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .active_set import solve_active
 from .checks import as_data, is_finite
 from .dual_active_set import SOLVED_FLAG, Daqp, sense_of, solve_daqp
 from .errors import InfeasibleError, SolveError, Status
@@ -122,13 +123,21 @@ class Solver:
         shared_bounds = lower.ndim == upper.ndim == 1
         vectors = (theta,) if shared_bounds else (theta, lower, upper)
         batch, _, (samples, *bounds) = flatten_batch((self.reduction.G,), vectors)
-        self._check_finite(samples)
+        check_finite(samples, self.sizes)
         lower, upper = bounds if bounds else (lower, upper)
         one_each = self if self.reduction.G.ndim == 2 else replace(self, reduction=self.reduction.of_batch(batch))
         solved = one_each._solve(samples, lower, upper, daqp_first)
-        self._report(solved, batch)
+        report_failures(solved.info, batch, self.on_failure)
         v, *rest = (x.reshape(*batch, x.shape[-1]) for x in solved)
         return Planned(*self.sizes.split(v), *rest)
+
+    def independent(self, theta: Tensor, planned: Planned) -> Tensor:
+        """Return whether the rows held at a bound are independent, `(*batch,)`."""
+        batch, _, (active,) = flatten_batch((self.reduction.G,), (planned.active,))
+        one_each = self.reduction.of_batch(batch)
+        return solve_active(one_each.G, one_each.Ct, active, torch.zeros_like(active, dtype=torch.float64))[1].reshape(
+            batch
+        )
 
     def _solve(self, theta: Tensor, lower: Tensor, upper: Tensor, daqp_first: bool) -> Solved:
         """Run the first engine on the batch, the second on what it left."""
@@ -144,12 +153,6 @@ class Solver:
             subset._mark_failures(solved, rest, *problem)
         return solved
 
-    def _check_finite(self, theta: Tensor) -> None:
-        if is_finite(theta):
-            return
-        for name, part in zip(("u_ini", "y_ini", "u_ref", "y_ref"), theta.split(self.sizes.theta, dim=-1), strict=True):
-            as_data(name, part)
-
     def _is_daqp_first(self, theta: Tensor) -> bool:
         """DAQP is faster for a few problems with one matrix, Newton for many; `scripts/benchmark.py` shows where."""
         count = theta.numel() // theta.shape[-1]
@@ -158,7 +161,7 @@ class Solver:
 
     def _are_few(self, theta: Tensor, lower: Tensor, upper: Tensor) -> bool:
         """Whether NumPy can take the samples one by one: few, on the CPU, and nothing to look at sample by sample."""
-        shared = lower.ndim == upper.ndim == 1 and self.reduction.rows.u_ini_range is None
+        shared = lower.ndim == upper.ndim == 1 and self.reduction.rows.Eq_range is None
         few = theta.numel() <= FEW * theta.shape[-1] and theta.device.type == "cpu"
         return shared and few and math.isfinite(theta.numpy().sum())
 
@@ -221,23 +224,33 @@ class Solver:
             for emptied in (solved.lam[i], solved.active[i], solved.info[i, 3:]):
                 emptied.zero_()
 
-    def _report(self, solved: Solved, batch: torch.Size) -> None:
-        failed = solved.failed.nonzero()[:, 0]
-        if self.on_failure == "nan" or len(failed) == 0:
-            return
-        infeasible = (solved.info[failed, 0] == Status.INFEASIBLE).tolist()
-        places = [tuple(int(j) for j in torch.unravel_index(i, batch)) if batch else () for i in failed]
-        where = f"batch {'index' if len(places) == 1 else 'indices'} {_listed(places)}" if batch else "the problem"
-        hint = 'on_failure="nan" marks such samples and returns the others.'
-        if all(infeasible):
-            why = "no trajectory meets the constraints (the data cannot produce u_ini, or the bounds exclude all)"
-            raise InfeasibleError(f"{where}: {why}. {hint}", places)
-        worst = float(solved.info[failed, 2].max())
-        raise SolveError(
-            f"{where}: no engine reached a residual of {ACCEPTED:g} (got {worst:.1e}), and {sum(infeasible)} of "
-            f"{len(places)} are proven infeasible. Badly scaled data or weights are the usual reason. {hint}",
-            places,
-        )
+
+def check_finite(theta: Tensor, sizes: Sizes) -> None:
+    """Raise ValueError, naming the part of theta that holds it, at a value that is not finite."""
+    if is_finite(theta):
+        return
+    for name, part in zip(("u_ini", "y_ini", "u_ref", "y_ref"), theta.split(sizes.theta, dim=-1), strict=True):
+        as_data(name, part)
+
+
+def report_failures(info: Tensor, batch: torch.Size, on_failure: str) -> None:
+    """Raise what the samples without a solution call for, given the info table `(B, 5)`."""
+    failed = (info[:, 0] != Status.SOLVED).nonzero()[:, 0]
+    if on_failure == "nan" or len(failed) == 0:
+        return
+    infeasible = (info[failed, 0] == Status.INFEASIBLE).tolist()
+    places = [tuple(int(j) for j in torch.unravel_index(i, batch)) if batch else () for i in failed]
+    where = f"batch {'index' if len(places) == 1 else 'indices'} {_listed(places)}" if batch else "the problem"
+    hint = 'on_failure="nan" marks such samples and returns the others.'
+    if all(infeasible):
+        why = "no trajectory meets the constraints (the data cannot produce u_ini, or the bounds exclude all)"
+        raise InfeasibleError(f"{where}: {why}. {hint}", places)
+    worst = float(info[failed, 2].max())
+    raise SolveError(
+        f"{where}: no engine reached a residual of {ACCEPTED:g} (got {worst:.1e}), and {sum(infeasible)} of "
+        f"{len(places)} are proven infeasible. Badly scaled data or weights are the usual reason. {hint}",
+        places,
+    )
 
 
 def _listed(places: list[tuple[int, ...]], most: int = 10) -> str:

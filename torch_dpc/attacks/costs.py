@@ -15,8 +15,8 @@ from torch import Tensor
 
 from ..checks import as_data
 from ..hankel import HankelData
-from ..problem import weight_matrix
 from ..solution import DPCSolution
+from ..weights import weight_matrix
 from .predictor import Predictor
 from .references import last_rows, to_horizon
 

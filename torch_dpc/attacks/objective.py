@@ -104,7 +104,10 @@ class Objective:
         def placed(new: Tensor, old: Tensor) -> Tensor:
             return old.index_put((of,), new)
 
-        info = SolveInfo(placed(part.info.table, last.info.table), part.info.is_selection)
+        def nonsingular() -> Tensor:
+            return placed(part.info.nonsingular, last.info.nonsingular)
+
+        info = SolveInfo(placed(part.info.table, last.info.table), part.info.is_selection, nonsingular)
         whole = {name: placed(getattr(part, name), getattr(last, name)) for name in ("u", "y", "lam")}
         return replace(part, info=info, _make_g=lambda: placed(part.g, last.g), **whole)
 
@@ -160,5 +163,5 @@ def _reference(name: str, value: Any, horizon: int | None, batch: torch.Size) ->
 
 
 def _detached(solution: DPCSolution) -> DPCSolution:
-    info = SolveInfo(solution.info.table.detach(), solution.info.is_selection)
+    info = SolveInfo(solution.info.table.detach(), solution.info.is_selection, lambda: solution.info.nonsingular)
     return replace(solution, u=solution.u.detach(), y=solution.y.detach(), lam=solution.lam.detach(), info=info)
