@@ -1,8 +1,7 @@
 """Attacks on the measurements: costs, budgets, and how to choose a perturbation."""
 
-from .budgets import Ball, Budget, L1Ball, PerChannel, RelativeBall, SparseBall
+from .budgets import Ball, Box, Budget, Ellipsoid, L1Ball, PerChannel, RelativeBall, SparseBall
 from .costs import Cost, TargetInput, TrackingError
-from .entry_budgets import Box, Ellipsoid
 from .gradient import LinearizedAttack
 from .iterative import FrankWolfeAttack, ProjectedGradientAttack
 from .predictor import Predictor

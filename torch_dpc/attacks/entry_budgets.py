@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .budgets import Budget, direction, euclidean, nonnegative, ratio
+from .budget_base import Budget, direction, euclidean, nonnegative, ratio
 
 
 class Box(Budget):

@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..layer import DPCLayer
-from .budgets import Budget, direction, euclidean
+from .budget_base import Budget, direction, euclidean
 from .loop import PATIENCE, IterativeAttack, Walk
 
 #: What a projected-gradient step that does not improve psi makes of the step size, and one that does.
