@@ -42,7 +42,8 @@ HEAD = """# How much of an attack survives partial knowledge
 
 Shares of what Algorithm 1 with full knowledge does: of its decrease of psi on held-out windows, and on the masses of
 its mean tracking error in closed loop. Mean over the seeds, in brackets the extremes. The attacker plans on a surrogate
-that differs from the controller as the line says, or knows nothing and asks the controller for its inputs."""
+that differs from the controller as the line says, or knows nothing and asks the controller for its inputs. The cosine
+is that between its p, of one step, and Algorithm 1's with full knowledge."""
 
 
 def attackers(plant: Plant, victim: dpc.DPCLayer, seed: int) -> Iterator[tuple[str, str, str, Any]]:
@@ -69,10 +70,12 @@ def run_seed(name: str, seed: int, every: int) -> list[dict[str, Any]]:
     u_ini, y_ini = plant.windows
     cost = plant.cost.at(0)
     nominal = cost(victim(u_ini, y_ini, **plant.refs))
-    rows = []
+    rows, full_p = [], None
     for kind, knows, method, attack in attackers(plant, victim, seed):
         generator = torch.Generator().manual_seed(ATTACK_SEED + seed)
         p = attack(u_ini, y_ini, **plant.refs, generator=generator)
+        full_p = p if full_p is None else full_p
+        cosine = float(torch.nn.functional.cosine_similarity(p.flatten(1), full_p.flatten(1)).mean())
         plan = victim(u_ini, y_ini + p, **plant.refs, on_failure="nan")
         solved = plan.info.status == dpc.Status.SOLVED
         decrease = float((nominal - cost(plan))[solved].mean())
@@ -80,6 +83,7 @@ def run_seed(name: str, seed: int, every: int) -> list[dict[str, Any]]:
         in_closed_loop = name == "masses" and (method != MORE_STEPS or knows == FULL)
         error = closed_loop_error(plant, victim, attack, seed) if in_closed_loop else np.nan
         row = {"plant": name, "seed": seed, "kind": kind, "knows": knows, "method": method, "queries": queries}
+        row["cosine"] = cosine  # with what Algorithm 1 does with full knowledge, the first of all
         row |= {"psi": float(nominal.mean()), "decrease": decrease, "unsolved": int((~solved).sum()), "error": error}
         rows.append(row)
     full = next(row for row in rows if (row["knows"], row["method"]) == (FULL, ONE_STEP))
@@ -133,12 +137,13 @@ def table(rows: Rows, plant: str) -> list[str]:
     has_error = bool(np.isfinite(error))
     text = f"Without an attack psi is {psi:.3g}; Algorithm 1 takes {decrease:.3g} from it"
     text += f", and leaves a mean error of {error:.3g} m in closed loop." if has_error else "."
-    head = ["the attacker has", "queries a window", "psi: one step or search", "psi: projected gradient"]
+    head = ["the attacker has", "queries a window", "cosine", "psi: one step or search", "psi: projected gradient"]
     head += ["error in closed loop, one step or search"] * has_error
     lines = [f"## {TITLES[plant]}", "", text, "", "| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for _, knows, methods in cases(rows, plant):
         first = methods[0]
         cells = [knows, f"{pick(rows, plant, knows, first, 'queries').mean():.0f}"]
+        cells += [f"{pick(rows, plant, knows, first, 'cosine').mean():.2f}"]
         cells += [share(pick(rows, plant, knows, first, "share"))]
         cells += [share(pick(rows, plant, knows, MORE_STEPS, "share")) if MORE_STEPS in methods else "-"]
         cells += [share(pick(rows, plant, knows, first, "error_share"))] * has_error

@@ -190,6 +190,21 @@ class Watched:
         return self.layer(u_ini, y_ini, **options)
 
 
+class Fragile(Watched):
+    """A layer that has no plan for a window longer than a limit."""
+
+    limit = 1.001
+
+    def __call__(self, u_ini, y_ini, **options):
+        sol = self.layer(u_ini, y_ini, **options)
+        lost = torch.linalg.vector_norm(y_ini, dim=(-2, -1)) > self.limit
+        table = sol.info.table.clone()
+        table[lost, 0] = dpc.Status.FAILED
+        info = copy.copy(sol.info)
+        info.table = table
+        return dataclasses.replace(sol, u=torch.where(lost[:, None, None], torch.nan, sol.u), info=info)
+
+
 def test_samples_without_a_gradient_or_progress_leave_the_batch():
     layer, (u_ini, y_ini), _, cost, rho = masses()
     watched = Watched(layer)
@@ -207,6 +222,15 @@ def test_samples_without_a_gradient_or_progress_leave_the_batch():
 
     attacks.ProjectedGradientAttack(stuck, only_gets_worse, attacks.Ball(1e-3), steps=100)(u_ini, y_ini)
     assert len(stuck.sizes) <= PATIENCE + 2
+
+
+def test_samples_without_a_plan_leave_at_once():
+    layer, (u_ini, y_ini), refs, cost, _ = masses()
+    fragile = Fragile(layer)
+    fragile.limit, y_ini = 0.5, torch.ones_like(y_ini)
+    for make in (attacks.ProjectedGradientAttack, attacks.FrankWolfeAttack):
+        watched = Watched(fragile)
+        assert not make(watched, cost, attacks.Ball(0.1))(u_ini, y_ini, **refs).any() and watched.sizes == [20]
 
 
 def test_cut_off_after_its_first_step_the_loop_is_algorithm_1():
@@ -229,21 +253,6 @@ def test_restarts_repeat_by_their_generator_and_never_hurt():
     assert torch.equal(more, again) and not torch.equal(more, other)
     psi_one, psi_more = (psi_at(layer, cost, u_ini, y_ini, p, refs) for p in (one, more))
     assert (psi_more <= psi_one * (1 + ROUNDING)).all() and psi_more.mean() < psi_one.mean() - 1e-3
-
-
-class Fragile(Watched):
-    """A layer that has no plan for a window longer than a limit."""
-
-    limit = 1.001
-
-    def __call__(self, u_ini, y_ini, **options):
-        sol = self.layer(u_ini, y_ini, **options)
-        lost = torch.linalg.vector_norm(y_ini, dim=(-2, -1)) > self.limit
-        table = sol.info.table.clone()
-        table[lost, 0] = dpc.Status.FAILED
-        info = copy.copy(sol.info)
-        info.table = table
-        return dataclasses.replace(sol, u=torch.where(lost[:, None, None], torch.nan, sol.u), info=info)
 
 
 @every_attack

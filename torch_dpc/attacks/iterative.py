@@ -67,7 +67,8 @@ class ProjectedGradientAttack(IterativeAttack):
         return self.budget.project(walk.best_p - step, y_ini)
 
     def _may_go_on(self, walk: Walk, promises: Tensor) -> Tensor:
-        return (promises | (walk.stalls > 0)) & (walk.stalls < PATIENCE)  # a stalled sample goes on from its best
+        onward = promises | (walk.stalls > 0)  # after a step that failed it goes on from the best
+        return onward & walk.best_psi.isfinite() & (walk.stalls < PATIENCE)
 
 
 class FrankWolfeAttack(IterativeAttack):
