@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..layer import DPCLayer
 from .budget_base import Budget, direction, euclidean
-from .loop import PATIENCE, IterativeAttack, Walk
+from .loop import IterativeAttack, Walk
 
 #: What a projected-gradient step that does not improve psi makes of the step size, and one that does.
 SHORTER, LONGER = 0.5, 1.5
@@ -39,6 +39,8 @@ class ProjectedGradientAttack(IterativeAttack):
         True
     """
 
+    takes_back = True
+
     def __init__(
         self,
         layer: DPCLayer,
@@ -57,18 +59,13 @@ class ProjectedGradientAttack(IterativeAttack):
             raise ValueError(f"`momentum` must be at least 0 and below 1, got {momentum!r}.")
         self.step_size, self.momentum = step_size, momentum
 
-    def _step(self, walk: Walk, vertex: Tensor, y_ini: Tensor, k: int) -> Tensor:
+    def _direction(self, walk: Walk, vertex: Tensor, y_ini: Tensor, k: int) -> Tensor:
         stalled = (walk.stalls > 0)[..., None, None]
         walk.size = walk.size * torch.where(stalled, SHORTER, LONGER)
-        velocity = self.momentum * walk.velocity + direction(walk.best_gradient)
-        walk.velocity = torch.where(stalled, direction(walk.best_gradient), velocity)
+        velocity = self.momentum * walk.velocity + direction(walk.gradient)
+        walk.velocity = torch.where(stalled, direction(walk.gradient), velocity)
         reach = euclidean(self.budget.minimize_linear(walk.velocity, y_ini))
-        step = self.step_size * walk.size * reach * direction(walk.velocity)
-        return self.budget.project(walk.best_p - step, y_ini)
-
-    def _may_go_on(self, walk: Walk, promises: Tensor) -> Tensor:
-        onward = promises | (walk.stalls > 0)  # after a step that failed it goes on from the best
-        return onward & walk.best_psi.isfinite() & (walk.stalls < PATIENCE)
+        return -self.step_size * walk.size * reach * direction(walk.velocity)
 
 
 class FrankWolfeAttack(IterativeAttack):
@@ -78,6 +75,8 @@ class FrankWolfeAttack(IterativeAttack):
     and only there, it is projected.
     """
 
-    def _step(self, walk: Walk, vertex: Tensor, y_ini: Tensor, k: int) -> Tensor:
-        p = walk.p + 2 / (k + 2) * (vertex - walk.p)
-        return p if self.budget.convex else self.budget.project(p, y_ini)
+    def _direction(self, walk: Walk, vertex: Tensor, y_ini: Tensor, k: int) -> Tensor:
+        return 2 / (k + 2) * (vertex - walk.p)
+
+    def _project(self, p: Tensor, y_ini: Tensor) -> Tensor:
+        return p if self.budget.convex else super()._project(p, y_ini)

@@ -1,4 +1,4 @@
-"""Attacks of several gradient steps: one loop, with hooks for the start and the step (its direction and projection).
+"""Attacks of several gradient steps: one loop, with hooks for the start, the direction of a step and its projection.
 
 The first walk starts at p = 0 with Algorithm 1's step, so Algorithm 1 is the loop cut off after that. The best
 perturbation seen is kept, sample by sample: never worse than Algorithm 1, nor than no attack.
@@ -63,6 +63,10 @@ class Walk:
         self.best_gradient = torch.where(chosen, gradient, self.best_gradient)
         self.stalls = torch.where(better, 0.0, self.stalls + 1)
 
+    def return_to_best(self) -> None:
+        """Take back steps that did not improve psi."""
+        self.p, self.psi, self.gradient = self.best_p, self.best_psi, self.best_gradient
+
 
 def improves(psi: Tensor, least: Tensor) -> Tensor:
     """Return whether psi is below the least so far by more than rounding."""
@@ -79,6 +83,9 @@ class IterativeAttack:
         steps: gradient steps after the first.
         restarts: walks, each from a start of its own: the first from zero, the others from random perturbations.
     """
+
+    #: Whether a step that does not improve psi is taken back, so that the next one starts from the best.
+    takes_back = False
 
     def __init__(self, layer: DPCLayer, cost: Any, budget: Budget, steps: int = 20, *, restarts: int = 1):
         if not isinstance(steps, int) or isinstance(steps, bool) or steps < 0:
@@ -124,13 +131,19 @@ class IterativeAttack:
         active = torch.ones_like(walk.psi, dtype=torch.bool)
         for k in range(self.steps + 1):
             walk.see(*objective.gradient(walk.p, active))
+            if self.takes_back:
+                walk.return_to_best()
             vertex = self.budget.minimize_linear(walk.gradient, objective.y_ini)
             promised = (walk.gradient * (walk.p - vertex)).sum((-2, -1))
             floor = torch.where(walk.psi.isfinite(), NOISE_FLOOR * walk.psi.abs(), torch.inf)
-            active = active & self._may_go_on(walk, promised > floor)
+            active = active & (promised > floor) & (walk.stalls < PATIENCE)
             if not bool(active.any()):
                 return walk
-            moved = vertex if is_first and k == 0 else self._step(walk, vertex, objective.y_ini, k)
+            if is_first and k == 0:
+                moved = vertex  # Algorithm 1
+            else:
+                step = self._direction(walk, vertex, objective.y_ini, k)
+                moved = self._project(walk.p + step, objective.y_ini)
             walk.p = torch.where(active[..., None, None], moved, walk.p)
         return self._end(walk, objective, active)
 
@@ -138,13 +151,13 @@ class IterativeAttack:
         """Return where a walk starts."""
         return torch.zeros_like(y_ini) if restart == 0 else self.budget.random(y_ini, generator)
 
-    def _step(self, walk: Walk, vertex: Tensor, y_ini: Tensor, k: int) -> Tensor:
-        """Return the next p of every sample; `vertex` minimises the linearisation at walk.p over the budget."""
+    def _direction(self, walk: Walk, vertex: Tensor, y_ini: Tensor, k: int) -> Tensor:
+        """Return the step from walk.p, length included; `vertex` minimises the linearisation there over the budget."""
         raise NotImplementedError
 
-    def _may_go_on(self, walk: Walk, promises: Tensor) -> Tensor:
-        """Return which samples take another step, given whether their gradient promises anything."""
-        return promises & (walk.stalls < PATIENCE)
+    def _project(self, p: Tensor, y_ini: Tensor) -> Tensor:
+        """Return what a step that may have left the budget becomes."""
+        return self.budget.project(p, y_ini)
 
     def _end(self, walk: Walk, objective: Objective, active: Tensor) -> Walk:
         """Look at the last step."""
