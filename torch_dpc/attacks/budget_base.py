@@ -36,8 +36,9 @@ class Budget:
 
 
 def standard_normal(y_ini: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Return standard normal numbers of the shape of a window."""
-    return torch.randn(y_ini.shape, dtype=y_ini.dtype, device=y_ini.device, generator=generator)
+    """Return standard normal numbers of the shape of a window, drawn where the generator is."""
+    device = y_ini.device if generator is None else generator.device
+    return torch.randn(y_ini.shape, dtype=y_ini.dtype, device=device, generator=generator).to(y_ini.device)
 
 
 def euclidean(p: Tensor) -> Tensor:

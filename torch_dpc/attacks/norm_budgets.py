@@ -98,8 +98,9 @@ class L1Ball(NormBall):
         return shrunk * _shrink(self._norm(shrunk), reach)  # the rounding of a long sum
 
     def random(self, y_ini: Tensor, generator: torch.Generator | None = None) -> Tensor:
-        uniform = torch.rand(y_ini.shape, dtype=y_ini.dtype, device=y_ini.device, generator=generator)
-        p = standard_normal(y_ini, generator).sign() * -torch.log1p(-uniform)  # uniform on the surface
+        # Laplace numbers, each half the difference of two squared lengths in the plane: uniform on the surface
+        x = standard_normal(y_ini.expand(4, *y_ini.shape), generator).square()
+        p = x[0] + x[1] - x[2] - x[3]
         return p * self._reach(y_ini) / self._norm(p)
 
     def _norm(self, p: Tensor) -> Tensor:

@@ -16,7 +16,7 @@ from torch import Tensor
 
 from ..checks import as_data, check_count
 from ..layer import DPCLayer
-from .budgets import Budget
+from .budget_base import Budget, standard_normal
 from .iterative import ProjectedGradientAttack
 from .loop import improves
 from .objective import Objective, checked, is_everyone
@@ -96,7 +96,7 @@ class QueryObjective(Objective):
         if self.directions is None:
             flat = torch.eye(size, dtype=p.dtype, device=p.device)
         else:
-            flat = torch.randn(self.directions, size, dtype=p.dtype, device=p.device, generator=self.generator)
+            flat = standard_normal(p.new_empty(self.directions, size), self.generator)
         return flat.reshape(-1, *p.shape[-2:])
 
     def _all_psi(self, p: Tensor, of: Tensor | None) -> Tensor:
