@@ -71,10 +71,12 @@ class ConvexSolver:
             ValueError: values that are not finite.
             InfeasibleError, SolveError: with `on_failure="raise"`, if a sample has no accepted solution.
         """
-        sets, gamma = self.sets, self.gamma
+        # As they are now: the backward must not see what the sets become later.
+        sets, gamma = self.sets.snapshot(), self.gamma
         order, inverse = sets.order.to(theta.device), sets.inverse.to(theta.device)
-        v, lam, weak, active, info = _Find.apply(theta.detach(), self)
-        solved = info[..., :1] == Status.SOLVED
+        # Detached again: under torch.func the sets' own parameters are seen through the solve.
+        v, lam, weak, active, info = (found.detach() for found in _Find.apply(theta.detach(), self))
+        solved = info[..., :1] == float(Status.SOLVED)
         # The solution is known: what follows attaches its derivative.
         v0 = times(reduction.rows.C, times(reduction.A_theta, theta))[..., order]
         G = reduction.G[..., order[:, None], order]

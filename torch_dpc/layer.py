@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from typing import Any
 
@@ -149,7 +150,7 @@ class DPCLayer(nn.Module):
 
     @property
     def reduced_kkt_size(self) -> int:
-        """Unknowns of the reduced system: horizon (n_u + n_y), and horizon n_u more where changes of the input count."""
+        """Unknowns of the reduced system: horizon (n_u + n_y), horizon n_u more where changes of the input count."""
         return self.sizes.v
 
     @property
@@ -177,6 +178,11 @@ class DPCLayer(nn.Module):
             InfeasibleError: a sample has no solution, provably (with `on_failure="raise"`).
             SolveError: a sample could not be solved (likewise).
         """
+        if torch.compiler.is_compiling():  # a compiled model breaks its graph here
+            return _uncompiled()(self, u_ini, y_ini, y_ref, u_ref, on_failure)
+        return self._call(u_ini, y_ini, y_ref, u_ref, on_failure)
+
+    def _call(self, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any, on_failure: str | None) -> DPCSolution:
         theta, dtype = self.flatten(u_ini, y_ini, y_ref, u_ref)
         if self.feasible_set.is_box:
             return self.plan(theta, *self.bounds(theta.device), dtype=dtype, on_failure=on_failure)
@@ -389,6 +395,12 @@ class DPCLayer(nn.Module):
         else:
             g = a @ basis.mT
         return torch.where(info[..., :1] == Status.SOLVED, g, torch.nan)
+
+
+@functools.cache
+def _uncompiled() -> Any:
+    """`DPCLayer._call` out of the compiler's reach; made when it is there, because importing it takes a second."""
+    return torch.compiler.disable(DPCLayer._call)
 
 
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
