@@ -15,6 +15,7 @@ from .errors import Status
 from .feasible_set import FeasibleSet
 from .function import solve_reduced
 from .hankel import HankelData
+from .hankel_batch import HankelBatch
 from .linear import times
 from .problem import CompactForm, Sizes, compact_form
 from .projected_kkt import FullSystem
@@ -78,7 +79,7 @@ class DPCLayer(nn.Module):
 
     def __init__(
         self,
-        data: HankelData,
+        data: HankelData | HankelBatch,
         Q: Any,
         R: Any,
         lambda_g: Any,
@@ -99,8 +100,8 @@ class DPCLayer(nn.Module):
         _check_choice("backward", backward, ("reduced", "full"))
         _check_choice("solver", solver, ("auto", "newton", "daqp"))
         _check_choice("on_failure", on_failure, ("raise", "nan"))
-        if not isinstance(data, HankelData):
-            raise ValueError(f"`data` must be a HankelData, got {type(data).__name__}.")
+        if not isinstance(data, (HankelData, HankelBatch)):
+            raise ValueError(f"`data` must be a HankelData or a HankelBatch, got {type(data).__name__}.")
         _check_choice("regularizer", regularizer, ("projection", "identity"))
         self.data = data
         self.Q, self.R, self.lambda_g, self.lambda_s = Q, R, lambda_g, lambda_s
@@ -133,7 +134,7 @@ class DPCLayer(nn.Module):
     @property
     def reduction(self) -> Reduction:
         """The reduced problem of the present weights; see :mod:`torch_dpc.reduction`."""
-        return self._factors(self.data.Up.device)[0]
+        return self._factors(self.data.device)[0]
 
     @property
     def feasible_set(self) -> FeasibleSet:
@@ -230,8 +231,8 @@ class DPCLayer(nn.Module):
         """
         theta, _ = self.flatten(u_ini, y_ini, y_ref, u_ref)
         weights = self._weights(theta.device)
-        if weights.are_batched:
-            raise ValueError("`compact_form` takes one problem; the weights have a batch dimension.")
+        if weights.are_batched or isinstance(self.data, HankelBatch):
+            raise ValueError("`compact_form` takes one problem; the weights or the data have a batch dimension.")
         if self.du_set is not None:
             raise ValueError("`compact_form` has no rows for changes of the input; leave out `du_set`.")
         return compact_form(self.data, weights, theta, self.terms)
@@ -353,8 +354,8 @@ class DPCLayer(nn.Module):
     def _rows(self, device: torch.device) -> DataRows:
         """Return the rows of the data; weights that learn leave them alone."""
         if carries_derivative(self.data.matrices):
-            return DataRows.of(self.data, device, self.terms)
-        return self._cached(("rows", device), (self.data,), DataRows.of, self.data, device, self.terms)
+            return _rows_of(self.data, device, self.terms)
+        return self._cached(("rows", device), (self.data,), _rows_of, self.data, device, self.terms)
 
     def _factor(self, device: torch.device) -> tuple[Reduction, Solver | ConvexSolver]:
         reduction = reduce(self._rows(device), self._weights(device))
@@ -370,6 +371,7 @@ class DPCLayer(nn.Module):
                 )
             if self.terms != Terms():
                 raise ValueError('backward="full" is the system of the paper\'s problem; use backward="reduced".')
+            assert isinstance(self.data, HankelData)  # batches were refused with the batched reductions
             full = FullSystem(self.data, detached.weights)
         return reduction, Solver(detached, self.sizes, self.solver, self.on_failure, full)
 
@@ -378,9 +380,9 @@ class DPCLayer(nn.Module):
         return {**self.__dict__, "_cache": {}, "_sets": None}
 
     def _nonsingular(self, solver: Any, theta: Tensor, planned: Planned) -> Tensor:
-        reduction, space = solver.reduction, self.data.row_space
+        reduction, data = solver.reduction, self.data
         # The part of g that the data do not see is fixed by lambda_g alone.
-        fixed = (reduction.weights.lambda_g > 0) | (space.rank == self.data.n_g)
+        fixed = (reduction.weights.lambda_g > 0) | (torch.as_tensor(data.rank) == data.n_g)
         decided = reduction.rows.Eq_range is None and not reduction.is_selection
         with torch.no_grad():
             return solver.independent(theta.detach(), planned) & fixed & decided
@@ -388,13 +390,17 @@ class DPCLayer(nn.Module):
     def _g(self, reduction: Reduction, theta: Tensor, lam: Tensor, info: Tensor) -> Tensor:
         self.data.require_windows()
         a = times(reduction.A_theta, theta) - times(reduction.A_lam, lam)
-        basis = self.data.row_space.basis.to(a.device)
+        g = times(basis := self.data.basis.to(a.device), a)
         if reduction.rows.C.requires_grad:  # g = D^+ (D g), so that the data behind D are differentiated too
-            D = torch.cat([m.to(a) for m in self.data.matrices])
+            D = self.data.stacked.to(a.device)
             g = times(torch.linalg.pinv(D, rtol=1e-10), times(D @ basis, a))
-        else:
-            g = a @ basis.mT
         return torch.where(info[..., :1] == Status.SOLVED, g, torch.nan)
+
+
+def _rows_of(data: HankelData | HankelBatch, device: torch.device, terms: Terms) -> DataRows:
+    if isinstance(data, HankelData):
+        return DataRows.of(data, device, terms)
+    return DataRows.stack([DataRows.of(one, device, terms) for one in data.members])
 
 
 @functools.cache
