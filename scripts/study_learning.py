@@ -2,8 +2,8 @@
 
     python scripts/study_learning.py        # about 1 minute on two cores
 
-The paper's two plants at horizon 25, batch 16, windows of the recording perturbed by 2 %. A step is a forward, a backward
-of |u|^2 and a step of Adam. Leaves results/learning.md and results/learning.csv.
+The paper's two plants at horizon 25, batch 16, windows of the recording perturbed by 2 %. A step is a forward, a
+backward of |u|^2 and a step of Adam. Leaves results/learning.md and results/learning.csv.
 """
 
 from __future__ import annotations
@@ -122,7 +122,8 @@ def main(argv: list[str] | None = None) -> None:
         writer.writeheader()
         writer.writerows(rows)
     lines = [
-        f"{versions(1, 1).split(';')[0]}; {args.threads} threads; batch {BATCH}, median of {REPEATS} times {CALLS} calls.",
+        f"{versions(1, 1).split(';')[0]}; {args.threads} threads; batch {BATCH}, median of {REPEATS} times "
+        f"{CALLS} calls.",
         "",
         "| plant | problem | ten calls, forward + backward [s] | from | to | F at the solution |",
         "|---|---|---:|---:|---:|---:|",

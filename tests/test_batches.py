@@ -49,7 +49,8 @@ def test_a_batch_is_its_members(case, noises):
 @pytest.mark.parametrize("case", ["box", "ball"])
 def test_gradients_reach_measurements_weights_and_data(case):
     u_ini, y_ini = inputs(2)
-    recordings = [dpc.collect(dpc.systems.OscillatingMasses(), 90, generator=torch.Generator().manual_seed(s)) for s in (0, 1)]
+    plant, source = dpc.systems.OscillatingMasses(), torch.Generator().manual_seed(0)
+    recordings = [dpc.collect(plant, 90, generator=source) for _ in range(2)]
     noise = 1e-2 * randn(90, 4, seed=9)
     weights = randn(2, 6, 2, seed=5), randn(2, 6, 4, seed=6)
 

@@ -10,13 +10,13 @@ import torch
 from torch import Tensor
 
 from .errors import Status
-from .feasible_set import FeasibleSet
 from .infeasibility import separates_from_set
 from .linear import lead_all, times
 from .optimality import BATCHED, WEAKLY_ACTIVE, Optimality
 from .problem import Sizes
 from .projected_system import Implicit, solve_system
 from .reduction import Reduction
+from .sets.feasible import FeasibleSet
 from .solve import ACCEPTED, Planned, check_finite, report_failures
 from .splitting import scale_of, solve_convex
 

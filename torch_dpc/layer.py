@@ -12,7 +12,6 @@ from torch import Tensor, nn
 from .checks import reference, window, with_one_batch
 from .convex_solve import ConvexSolver
 from .errors import Status
-from .feasible_set import FeasibleSet
 from .function import solve_reduced
 from .hankel import HankelData
 from .hankel_batch import HankelBatch
@@ -23,6 +22,7 @@ from .reduction import Reduction, reduce
 from .rows import DataRows, Terms
 from .saving import load_layer, save_layer
 from .sets import ConvexSet, Reals
+from .sets.feasible import FeasibleSet
 from .solution import DPCSolution, SolveInfo
 from .solve import Planned, Solver
 from .transforms import carries_derivative

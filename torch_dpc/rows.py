@@ -120,8 +120,8 @@ class DataRows:
 
     def map(self, change: Callable[[Tensor, int], Tensor]) -> DataRows:
         """Return the rows with `change(tensor, own dimensions)` in place of each tensor that depends on the data."""
-        tails = {name: 1 if name == "charged" else 2 for name in _OF_DATA}
-        changed: dict[str, Any] = {name: change(x, tails[name]) for name in _OF_DATA if (x := getattr(self, name)) is not None}
+        there = {name: x for name in _OF_DATA if (x := getattr(self, name)) is not None}
+        changed: dict[str, Any] = {name: change(x, 1 if name == "charged" else 2) for name, x in there.items()}
         fits = tuple(replace(fit, rows=change(fit.rows, 2)) for fit in self.fits)
         return replace(self, **changed, fits=fits)
 

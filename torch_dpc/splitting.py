@@ -20,9 +20,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .feasible_set import FeasibleSet
 from .linear import times
 from .projected_system import solve_system
+from .sets.feasible import FeasibleSet
 
 #: Splitting steps before Newton.
 SPLITTING_STEPS = 20

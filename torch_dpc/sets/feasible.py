@@ -10,7 +10,8 @@ from typing import cast
 import torch
 from torch import Tensor, nn
 
-from .sets import Box, ConvexSet, Part
+from .base import ConvexSet, Part
+from .box import Box
 
 #: The Jacobian of the projection, part by part: its diagonal `(..., groups, size)` where the set is separable, blocks
 #: `(..., groups, size, size)` otherwise.
