@@ -18,7 +18,7 @@ from .projected_system import Implicit, solve_system
 from .reduction import Reduction
 from .sets.feasible import FeasibleSet
 from .solve import ACCEPTED, Planned, check_finite, report_failures
-from .splitting import scale_of, solve_convex
+from .splitting import resolvent_of, scale_of, solve_convex
 
 #: Eigenvalues of D1 below this hold their direction.
 HELD = 1e-9
@@ -55,6 +55,10 @@ class ConvexSolver:
     @cached_property
     def _Ct(self) -> Tensor:
         return self.reduction.Ct[..., self.sets.order.to(self.reduction.Ct.device), :]
+
+    @cached_property
+    def _resolvent(self) -> Tensor:
+        return resolvent_of(self._G, self.gamma)
 
     @cached_property
     def _optimality(self) -> Optimality:
@@ -105,7 +109,7 @@ class ConvexSolver:
     def _solve(self, theta: Tensor) -> tuple[Tensor, ...]:
         sets, gamma, order = self.sets, self.gamma, self.sets.order.to(theta.device)
         a0, v0 = self._optimality.unconstrained(theta)
-        found = solve_convex(self._G, self._Ct, v0[..., order], sets, gamma)
+        found = solve_convex(self._G, self._Ct, self._resolvent, v0[..., order], sets, gamma)
         lam = found.lam
         a = a0 - times(self.reduction.A_lam, lam[..., sets.inverse.to(theta.device)])
         raw = times(self.reduction.rows.C, a)
