@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torch_dpc import Box, DPCLayer
+from torch_dpc import Box, DPCLayer, HankelData
 from torch_dpc.checks import is_finite
 from torch_dpc.problem import Sizes, projector
 from torch_dpc.reduction import Reduction
@@ -51,6 +51,13 @@ def bounds_of(layer: DPCLayer) -> tuple[Tensor, Tensor]:
     return lower, upper
 
 
+def data_of(layer: DPCLayer) -> HankelData:
+    """Return the data of a layer of one problem."""
+    if not isinstance(layer.data, HankelData):
+        raise ValueError("the baselines take one problem; the layer has a batch of data sets.")
+    return layer.data
+
+
 class CostRows(NamedTuple):
     """The paper's four cost terms as least-squares rows, lambda_g and lambda_s in them."""
 
@@ -63,7 +70,7 @@ class CostRows(NamedTuple):
 
 def cost_rows_of(layer: DPCLayer) -> CostRows:
     """Return sqrt(R), sqrt(Q), sqrt(2 lambda_g) M, sqrt(2 lambda_s) Yp and sqrt(2 lambda_s)."""
-    data = layer.data
+    data = data_of(layer)
     with torch.no_grad():
         root_g, root_s = (
             (2 * penalty(name, value)).sqrt()

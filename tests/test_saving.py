@@ -236,7 +236,7 @@ def test_sets_say_how_they_are_written(tmp_path, registry):
 def test_what_may_be_registered(registry):
     with pytest.raises(ValueError, match="subclass of ConvexSet"):
         dpc.register_set(dict)
-    with pytest.raises(ValueError, match="'Box' is taken by torch_dpc.sets.Box"):
+    with pytest.raises(ValueError, match="'Box' is taken by torch_dpc.sets.box.Box"):
         dpc.register_set(type("Box", (dpc.ConvexSet,), {}))
     dpc.register_set(Tube)
     dpc.register_set(Tube)  # a cell of a notebook runs twice

@@ -4,6 +4,7 @@ from . import attacks, systems
 from .controller import DPCController
 from .errors import ExcitationWarning, InfeasibleError, SolveError, Status
 from .hankel import HankelData, excitation_order, hankel
+from .hankel_batch import HankelBatch
 from .layer import DPCLayer
 from .problem import CompactForm
 from .saving import register_set
@@ -24,6 +25,7 @@ __all__ = [
     "DPCLayer",
     "DPCSolution",
     "ExcitationWarning",
+    "HankelBatch",
     "HankelData",
     "HankelStream",
     "InfeasibleError",

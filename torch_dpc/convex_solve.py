@@ -10,15 +10,15 @@ import torch
 from torch import Tensor
 
 from .errors import Status
-from .feasible_set import FeasibleSet
 from .infeasibility import separates_from_set
 from .linear import lead_all, times
 from .optimality import BATCHED, WEAKLY_ACTIVE, Optimality
 from .problem import Sizes
 from .projected_system import Implicit, solve_system
 from .reduction import Reduction
+from .sets.feasible import FeasibleSet
 from .solve import ACCEPTED, Planned, check_finite, report_failures
-from .splitting import scale_of, solve_convex
+from .splitting import resolvent_of, scale_of, solve_convex
 
 #: Eigenvalues of D1 below this hold their direction.
 HELD = 1e-9
@@ -57,6 +57,10 @@ class ConvexSolver:
         return self.reduction.Ct[..., self.sets.order.to(self.reduction.Ct.device), :]
 
     @cached_property
+    def _resolvent(self) -> Tensor:
+        return resolvent_of(self._G, self.gamma)
+
+    @cached_property
     def _optimality(self) -> Optimality:
         return Optimality(self.reduction, BATCHED)
 
@@ -71,10 +75,12 @@ class ConvexSolver:
             ValueError: values that are not finite.
             InfeasibleError, SolveError: with `on_failure="raise"`, if a sample has no accepted solution.
         """
-        sets, gamma = self.sets, self.gamma
+        # As they are now: the backward must not see what the sets become later.
+        sets, gamma = self.sets.snapshot(), self.gamma
         order, inverse = sets.order.to(theta.device), sets.inverse.to(theta.device)
-        v, lam, weak, active, info = _Find.apply(theta.detach(), self)
-        solved = info[..., :1] == Status.SOLVED
+        # Detached again: under torch.func the sets' own parameters are seen through the solve.
+        v, lam, weak, active, info = (found.detach() for found in _Find.apply(theta.detach(), self))
+        solved = info[..., :1] == float(Status.SOLVED)
         # The solution is known: what follows attaches its derivative.
         v0 = times(reduction.rows.C, times(reduction.A_theta, theta))[..., order]
         G = reduction.G[..., order[:, None], order]
@@ -103,7 +109,7 @@ class ConvexSolver:
     def _solve(self, theta: Tensor) -> tuple[Tensor, ...]:
         sets, gamma, order = self.sets, self.gamma, self.sets.order.to(theta.device)
         a0, v0 = self._optimality.unconstrained(theta)
-        found = solve_convex(self._G, self._Ct, v0[..., order], sets, gamma)
+        found = solve_convex(self._G, self._Ct, self._resolvent, v0[..., order], sets, gamma)
         lam = found.lam
         a = a0 - times(self.reduction.A_lam, lam[..., sets.inverse.to(theta.device)])
         raw = times(self.reduction.rows.C, a)

@@ -175,7 +175,7 @@ class HankelData:
             >>> data.n_g, data.compressed().n_g, data.compressed().n_windows
             (84, 14, 84)
         """
-        rows = torch.cat([m.double() for m in self.matrices]) @ self.row_space.basis
+        rows = self.stacked @ self.basis
         Up, Yp, Uf, Yf = rows.split([len(m) for m in self.matrices])
         compact = replace(
             self, Up=Up, Uf=Uf, Yp=Yp, Yf=Yf, windows_seen=self.n_windows, recorded_as=self.recorded_as or self.Up.dtype
@@ -193,6 +193,21 @@ class HankelData:
         """The factorisation of the stacked data, made once; see :class:`torch_dpc.rowspace.RowSpace`."""
         with torch.inference_mode(False), torch.no_grad():
             return RowSpace.of(self)
+
+    @property
+    def device(self) -> torch.device:
+        """Where the data are."""
+        return self.Up.device
+
+    @property
+    def stacked(self) -> Tensor:
+        """The matrix [Up; Yp; Uf; Yf], float64; a graph is kept."""
+        return torch.cat([m.double() for m in self.matrices])
+
+    @property
+    def basis(self) -> Tensor:
+        """B of g = B a, `(n_g, rank)`."""
+        return self.row_space.basis
 
     @property
     def rank(self) -> int:

@@ -7,8 +7,8 @@ import torch
 from torch import Tensor
 
 from .dual_active_set import SOLVED_FLAG, Daqp
-from .feasible_set import FeasibleSet
 from .linear import times
+from .sets.feasible import FeasibleSet
 
 #: Directions of Ct below this fraction of the largest are none.
 DEPENDENT = 1e-10

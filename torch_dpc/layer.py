@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import os
 from typing import Any
 
@@ -11,9 +12,9 @@ from torch import Tensor, nn
 from .checks import reference, window, with_one_batch
 from .convex_solve import ConvexSolver
 from .errors import Status
-from .feasible_set import FeasibleSet
 from .function import solve_reduced
 from .hankel import HankelData
+from .hankel_batch import HankelBatch
 from .linear import times
 from .problem import CompactForm, Sizes, compact_form
 from .projected_kkt import FullSystem
@@ -21,6 +22,7 @@ from .reduction import Reduction, reduce
 from .rows import DataRows, Terms
 from .saving import load_layer, save_layer
 from .sets import ConvexSet, Reals
+from .sets.feasible import FeasibleSet
 from .solution import DPCSolution, SolveInfo
 from .solve import Planned, Solver
 from .transforms import carries_derivative
@@ -77,7 +79,7 @@ class DPCLayer(nn.Module):
 
     def __init__(
         self,
-        data: HankelData,
+        data: HankelData | HankelBatch,
         Q: Any,
         R: Any,
         lambda_g: Any,
@@ -98,8 +100,8 @@ class DPCLayer(nn.Module):
         _check_choice("backward", backward, ("reduced", "full"))
         _check_choice("solver", solver, ("auto", "newton", "daqp"))
         _check_choice("on_failure", on_failure, ("raise", "nan"))
-        if not isinstance(data, HankelData):
-            raise ValueError(f"`data` must be a HankelData, got {type(data).__name__}.")
+        if not isinstance(data, (HankelData, HankelBatch)):
+            raise ValueError(f"`data` must be a HankelData or a HankelBatch, got {type(data).__name__}.")
         _check_choice("regularizer", regularizer, ("projection", "identity"))
         self.data = data
         self.Q, self.R, self.lambda_g, self.lambda_s = Q, R, lambda_g, lambda_s
@@ -132,7 +134,7 @@ class DPCLayer(nn.Module):
     @property
     def reduction(self) -> Reduction:
         """The reduced problem of the present weights; see :mod:`torch_dpc.reduction`."""
-        return self._factors(self.data.Up.device)[0]
+        return self._factors(self.data.device)[0]
 
     @property
     def feasible_set(self) -> FeasibleSet:
@@ -149,7 +151,7 @@ class DPCLayer(nn.Module):
 
     @property
     def reduced_kkt_size(self) -> int:
-        """Unknowns of the reduced system: horizon (n_u + n_y), and horizon n_u more where changes of the input count."""
+        """Unknowns of the reduced system: horizon (n_u + n_y), horizon n_u more where changes of the input count."""
         return self.sizes.v
 
     @property
@@ -177,6 +179,11 @@ class DPCLayer(nn.Module):
             InfeasibleError: a sample has no solution, provably (with `on_failure="raise"`).
             SolveError: a sample could not be solved (likewise).
         """
+        if torch.compiler.is_compiling():  # a compiled model breaks its graph here
+            return _uncompiled()(self, u_ini, y_ini, y_ref, u_ref, on_failure)
+        return self._call(u_ini, y_ini, y_ref, u_ref, on_failure)
+
+    def _call(self, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any, on_failure: str | None) -> DPCSolution:
         theta, dtype = self.flatten(u_ini, y_ini, y_ref, u_ref)
         if self.feasible_set.is_box:
             return self.plan(theta, *self.bounds(theta.device), dtype=dtype, on_failure=on_failure)
@@ -224,8 +231,8 @@ class DPCLayer(nn.Module):
         """
         theta, _ = self.flatten(u_ini, y_ini, y_ref, u_ref)
         weights = self._weights(theta.device)
-        if weights.are_batched:
-            raise ValueError("`compact_form` takes one problem; the weights have a batch dimension.")
+        if weights.are_batched or isinstance(self.data, HankelBatch):
+            raise ValueError("`compact_form` takes one problem; the weights or the data have a batch dimension.")
         if self.du_set is not None:
             raise ValueError("`compact_form` has no rows for changes of the input; leave out `du_set`.")
         return compact_form(self.data, weights, theta, self.terms)
@@ -347,8 +354,8 @@ class DPCLayer(nn.Module):
     def _rows(self, device: torch.device) -> DataRows:
         """Return the rows of the data; weights that learn leave them alone."""
         if carries_derivative(self.data.matrices):
-            return DataRows.of(self.data, device, self.terms)
-        return self._cached(("rows", device), (self.data,), DataRows.of, self.data, device, self.terms)
+            return _rows_of(self.data, device, self.terms)
+        return self._cached(("rows", device), (self.data,), _rows_of, self.data, device, self.terms)
 
     def _factor(self, device: torch.device) -> tuple[Reduction, Solver | ConvexSolver]:
         reduction = reduce(self._rows(device), self._weights(device))
@@ -364,6 +371,7 @@ class DPCLayer(nn.Module):
                 )
             if self.terms != Terms():
                 raise ValueError('backward="full" is the system of the paper\'s problem; use backward="reduced".')
+            assert isinstance(self.data, HankelData)  # batches were refused with the batched reductions
             full = FullSystem(self.data, detached.weights)
         return reduction, Solver(detached, self.sizes, self.solver, self.on_failure, full)
 
@@ -372,9 +380,9 @@ class DPCLayer(nn.Module):
         return {**self.__dict__, "_cache": {}, "_sets": None}
 
     def _nonsingular(self, solver: Any, theta: Tensor, planned: Planned) -> Tensor:
-        reduction, space = solver.reduction, self.data.row_space
+        reduction, data = solver.reduction, self.data
         # The part of g that the data do not see is fixed by lambda_g alone.
-        fixed = (reduction.weights.lambda_g > 0) | (space.rank == self.data.n_g)
+        fixed = (reduction.weights.lambda_g > 0) | (torch.as_tensor(data.rank) == data.n_g)
         decided = reduction.rows.Eq_range is None and not reduction.is_selection
         with torch.no_grad():
             return solver.independent(theta.detach(), planned) & fixed & decided
@@ -382,13 +390,23 @@ class DPCLayer(nn.Module):
     def _g(self, reduction: Reduction, theta: Tensor, lam: Tensor, info: Tensor) -> Tensor:
         self.data.require_windows()
         a = times(reduction.A_theta, theta) - times(reduction.A_lam, lam)
-        basis = self.data.row_space.basis.to(a.device)
+        g = times(basis := self.data.basis.to(a.device), a)
         if reduction.rows.C.requires_grad:  # g = D^+ (D g), so that the data behind D are differentiated too
-            D = torch.cat([m.to(a) for m in self.data.matrices])
+            D = self.data.stacked.to(a.device)
             g = times(torch.linalg.pinv(D, rtol=1e-10), times(D @ basis, a))
-        else:
-            g = a @ basis.mT
         return torch.where(info[..., :1] == Status.SOLVED, g, torch.nan)
+
+
+def _rows_of(data: HankelData | HankelBatch, device: torch.device, terms: Terms) -> DataRows:
+    if isinstance(data, HankelData):
+        return DataRows.of(data, device, terms)
+    return DataRows.stack([DataRows.of(one, device, terms) for one in data.members])
+
+
+@functools.cache
+def _uncompiled() -> Any:
+    """`DPCLayer._call` out of the compiler's reach; made when it is there, because importing it takes a second."""
+    return torch.compiler.disable(DPCLayer._call)
 
 
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:

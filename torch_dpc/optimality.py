@@ -108,12 +108,12 @@ class Optimality:
         self._diagonal = array(reduction.G.diagonal(dim1=-2, dim2=-1).contiguous())
         self._Eq, self._C, self._Z = (array(m) for m in (rows.Eq, rows.C, rows.Z))
         self._Eq_theta = _as_slice(rows.Eq_theta)
-        self._charged, self._weight_g = rows.charged, array(2 * weights.lambda_g[..., None])
+        self._weight_g = array(2 * weights.lambda_g[..., None] * rows.charged)
         self._fits = [
             (
                 array(fit.rows),
                 array(2 * getattr(weights, fit.weight)[..., None]),
-                slice(fit.measured, fit.measured + len(fit.rows)),
+                slice(fit.measured, fit.measured + fit.rows.shape[-2]),
             )
             for fit in rows.fits
         ]
@@ -160,12 +160,11 @@ class Optimality:
         total, size_refs = self._tracked(theta, v, lam)
         terms = norm(total) + self._floor * (size_v + size_refs) + self._rounding * norm(a)
         for S, weight, measured in self._fits:
-            of_rows, of_measured = (weight * _times(S, a)) @ S, (weight * theta[..., measured]) @ S
+            of_rows, of_measured = _back(weight * _times(S, a), S), _back(weight * theta[..., measured], S)
             total = total + (of_rows - of_measured)
             terms = terms + norm(of_rows) + norm(of_measured)
-        of_M = self._weight_g * a[..., self._charged :]
-        total[..., self._charged :] += of_M
-        stationary = norm(total @ self._Z) / (terms + norm(of_M) + _TINY)
+        of_M = self._weight_g * a
+        stationary = norm(_back(total + of_M, self._Z)) / (terms + norm(of_M) + _TINY)
         return in_set + held + stationary
 
     def _tracked(self, theta: Any, v: Any, lam: Any) -> tuple[Any, Any]:
@@ -177,7 +176,7 @@ class Optimality:
                 part = part - theta[..., reference]
                 size = size + self._norm(theta[..., reference])
             w.append(lam[..., rows] if weight is None else lam[..., rows] + _times(weight, part))
-        return self._join(w) @ self._C, size
+        return _back(self._join(w), self._C), size
 
 
 def _as_slice(places: torch.Tensor) -> Any:
@@ -195,6 +194,10 @@ def _reference_of(term: Tracking) -> slice | None:
 
 #: Keeps 0 / 0 at 0.
 _TINY = 1e-300
+
+
+def _back(x: Any, matrix: Any) -> Any:
+    return x @ matrix if matrix.ndim == 2 else (x[..., None, :] @ matrix)[..., 0, :]
 
 
 def _times(matrix: Any, x: Any) -> Any:

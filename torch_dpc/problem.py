@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from .hankel import HankelData
+from .hankel_batch import HankelBatch
 from .rows import Terms
 from .weights import Weights
 
@@ -43,7 +44,7 @@ class Sizes:
     du: int = 0
 
     @staticmethod
-    def of(data: HankelData, terms: Terms = Terms()) -> Sizes:  # noqa: B008
+    def of(data: HankelData | HankelBatch, terms: Terms = Terms()) -> Sizes:  # noqa: B008
         """Read the sizes off the data."""
         past, future = data.t_ini, data.horizon
         n_u, n_y = data.n_u, data.n_y

@@ -64,9 +64,7 @@ class Reduction:
 
     def detach(self) -> Reduction:
         """Return the same numbers without their graph."""
-        rows = _map_tensors(self.rows, Tensor.detach)
-        rows = replace(rows, fits=tuple(replace(fit, rows=fit.rows.detach()) for fit in rows.fits))
-        weights = self.weights.map(lambda tensor, _: tensor.detach())
+        rows, weights = (part.map(lambda tensor, _: tensor.detach()) for part in (self.rows, self.weights))
         return replace(_map_tensors(self, Tensor.detach), rows=rows, weights=weights)
 
     def of_batch(self, batch: torch.Size) -> Reduction:
@@ -78,14 +76,16 @@ class Reduction:
             own = x.shape[x.ndim - tail :]
             return x.expand(*batch, *own).reshape(batch.numel(), *own)
 
-        return replace(_map_tensors(self, lambda x: spread(x, 2)), weights=self.weights.map(spread))
+        rows = self.rows if self.rows.C.ndim == 2 else self.rows.map(spread)
+        return replace(_map_tensors(self, lambda x: spread(x, 2)), rows=rows, weights=self.weights.map(spread))
 
     def of_samples(self, samples: Tensor) -> Reduction:
         """Return the problems of some samples of a flattened batch; itself where all share one problem."""
         if self.G.ndim == 2:
             return self
         weights = self.weights.map(lambda tensor, _: tensor[samples])
-        return replace(_map_tensors(self, lambda tensor: tensor[samples]), weights=weights)
+        rows = self.rows if self.rows.C.ndim == 2 else self.rows.map(lambda tensor, _: tensor[samples])
+        return replace(_map_tensors(self, lambda tensor: tensor[samples]), rows=rows, weights=weights)
 
 
 def _map_tensors(holder: Any, change: Callable[[Tensor], Tensor]) -> Any:
@@ -110,7 +110,7 @@ def reduce(rows: DataRows, weights: Weights) -> Reduction:
         CZ = rows.C @ rows.Z
         # A row that the equalities decide is zero here; its rounding would stand for a motion that does not exist.
         decided = CZ.norm(dim=-1) <= DECIDED * rows.C.norm(dim=-1)
-        CZ = torch.where(decided[:, None], 0.0, CZ)
+        CZ = torch.where(decided[..., None], 0.0, CZ)
         Ct = torch.linalg.solve_triangular(T, CZ, upper=True, left=False)
         X_theta = torch.linalg.solve_triangular(T, Qe.mT @ f, upper=True)
         # One step of refinement: it matters where weights of zero leave E a condition of 1e10.
@@ -134,10 +134,10 @@ def _least_squares(rows: DataRows, weights: Weights) -> tuple[Tensor, Tensor]:
     for term in rows.tracking:
         if (weight := getattr(weights, term.weight)) is not None:
             root = psd_root(weight)
-            blocks.append((root @ rows.C[term.rows], root, term.reference))
+            blocks.append((root @ rows.C[..., term.rows, :], root, term.reference))
     for fit in rows.fits:
         root = (2 * getattr(weights, fit.weight)).sqrt()[..., None, None]
-        blocks.append((root * fit.rows, root * _eye(len(fit.rows), fit.rows), fit.measured))
+        blocks.append((root * fit.rows, root * _eye(fit.rows.shape[-2], fit.rows), fit.measured))
     batch = torch.broadcast_shapes(*(block.shape[:-2] for block, _, _ in blocks))
     E, f = [], []
     for block, matrix, start in blocks:
@@ -172,7 +172,9 @@ def _factor(E: Tensor) -> tuple[Tensor, Tensor, bool]:
 
 def _charged(rows: DataRows) -> Tensor:
     """M in the coordinates a, the identity on the entries beyond the rank of W; or all of the identity."""
-    return _eye(rows.C.shape[-1], rows.C)[rows.charged :]
+    if rows.charged.ndim == 1:
+        return torch.diag(rows.charged)[rows.charged.bool()]
+    return torch.diag_embed(rows.charged)
 
 
 def _with_graph(rows: DataRows, weights: Weights, T: Tensor, A_theta: Tensor, A_lam: Tensor) -> tuple[Tensor, Tensor]:
@@ -181,7 +183,7 @@ def _with_graph(rows: DataRows, weights: Weights, T: Tensor, A_theta: Tensor, A_
     terms: list[tuple[Tensor, Tensor, int | None]] = []
     for term in rows.tracking:
         if (weight := getattr(weights, term.weight)) is not None:
-            block = rows.C[term.rows]
+            block = rows.C[..., term.rows, :]
             terms.append(((weight @ block).mT, block, term.reference))
     for fit in rows.fits:
         terms.append((2 * getattr(weights, fit.weight)[..., None, None] * fit.rows.mT, fit.rows, fit.measured))
@@ -194,8 +196,9 @@ def _with_graph(rows: DataRows, weights: Weights, T: Tensor, A_theta: Tensor, A_
         if start is not None:
             Phi = Phi + torch.nn.functional.pad(weighted, (start, rows.n_theta - start - weighted.shape[-1]))
     top = torch.cat([Phi, -rows.C.mT.expand(*batch, -1, -1)], dim=-1)
-    bottom = top.new_zeros(len(rows.Eq), top.shape[-1])
-    bottom[torch.arange(len(rows.Eq)), rows.Eq_theta] = 1.0
+    n_eq = rows.Eq.shape[-2]
+    bottom = top.new_zeros(n_eq, top.shape[-1])
+    bottom[torch.arange(n_eq), rows.Eq_theta] = 1.0
     solution = torch.cat([A_theta, -A_lam], dim=-1)
     saddle = Saddle(T=T, Z=rows.Z, Eq_pinv=rows.Eq_pinv)
     solution = known_solution(Psi, rows.Eq, top, bottom, solution.expand(*batch, -1, -1), saddle)
@@ -206,7 +209,7 @@ def _gram_of_charged(rows: DataRows) -> Tensor:
     """M = I - W^+ W in the coordinates a (or I), with its derivative at constant rank of W where W has a graph."""
     N = _charged(rows)
     M = N.mT @ N
-    W = torch.cat([rows.Up, rows.Yp, rows.Uf])
+    W = torch.cat([rows.Up, rows.Yp, rows.Uf], dim=-2)
     if not W.requires_grad or rows.is_identity:
         return M
     with torch.no_grad():

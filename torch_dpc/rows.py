@@ -11,12 +11,15 @@ of theta = (u_ini, y_ini, u_ref, y_ref). What each of the problem's terms adds i
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import torch
 from torch import Tensor
 
 from .hankel import HankelData
+from .linear import times
 from .transforms import carries_derivative
 
 #: How far u_ini may be from what the data can produce, relative to its norm.
@@ -74,7 +77,7 @@ class Fit:
 
 @dataclass(frozen=True, eq=False)
 class DataRows:
-    """The rows of a problem.
+    """The rows of a problem; leading dimensions, if any, are one data set each.
 
     Attributes:
         Up, Yp, Uf, Yf: the data, `(rows, r)`.
@@ -84,7 +87,8 @@ class DataRows:
         Eq_pinv: the pseudo-inverse of Eq, `(r, n_eq)`.
         Z: orthonormal basis of the kernel of Eq, `(r, n_x)`.
         Eq_range: orthonormal basis of the range of Eq, or None where it is everything.
-        charged: from where on lambda_g charges the entries of a: all, or those that W does not reach.
+        charged: which entries of a lambda_g charges, `(r,)` of ones and zeros: all, or those that W does not reach.
+        is_identity: whether that is all by choice.
         tracking, fits: the terms of the cost.
         n_theta: entries of theta.
     """
@@ -99,24 +103,51 @@ class DataRows:
     Eq_pinv: Tensor
     Z: Tensor
     Eq_range: Tensor | None
-    charged: int
+    charged: Tensor
+    is_identity: bool
     tracking: tuple[Tracking, ...]
     fits: tuple[Fit, ...]
     n_theta: int
-
-    @property
-    def is_identity(self) -> bool:
-        """Whether lambda_g charges all of a."""
-        return self.charged == 0
 
     def unreachable(self, theta: Tensor) -> Tensor:
         """Return which samples `(B,)` ask for a u_ini, or a terminal output, that no combination of the data makes."""
         if self.Eq_range is None:
             return torch.zeros(theta.shape[:-1], dtype=torch.bool, device=theta.device)
         wanted = theta[..., self.Eq_theta]
-        missed = wanted - (wanted @ self.Eq_range) @ self.Eq_range.mT
+        missed = wanted - times(self.Eq_range, times(self.Eq_range.mT, wanted))
         norm = torch.linalg.vector_norm
         return norm(missed, dim=-1) > REACHABLE * norm(wanted, dim=-1)
+
+    def map(self, change: Callable[[Tensor, int], Tensor]) -> DataRows:
+        """Return the rows with `change(tensor, own dimensions)` in place of each tensor that depends on the data."""
+        there = {name: x for name in _OF_DATA if (x := getattr(self, name)) is not None}
+        changed: dict[str, Any] = {name: change(x, 1 if name == "charged" else 2) for name, x in there.items()}
+        fits = tuple(replace(fit, rows=change(fit.rows, 2)) for fit in self.fits)
+        return replace(self, **changed, fits=fits)
+
+    @staticmethod
+    def stack(many: Sequence[DataRows]) -> DataRows:
+        """Return the rows of several data sets as one, a leading dimension; shorter row spaces are padded.
+
+        A padded coordinate meets no row and is charged by lambda_g, so it is zero at every solution.
+
+        Raises:
+            ValueError: the equalities have different ranks.
+        """
+        r = max(rows.C.shape[-1] for rows in many)
+        if len({rows.Z.shape[0] - rows.Z.shape[1] for rows in many}) > 1:
+            raise ValueError("the data sets of a batch must have one rank of Up: one has an idle input.")
+        padded = [_padded(rows, r - rows.C.shape[-1]) for rows in many]
+        first = padded[0]
+        changed: dict[str, Any] = {
+            name: torch.stack([getattr(rows, name) for rows in padded])
+            for name in _OF_DATA
+            if getattr(first, name) is not None
+        }
+        fits = tuple(
+            replace(fit, rows=torch.stack([rows.fits[i].rows for rows in padded])) for i, fit in enumerate(first.fits)
+        )
+        return replace(first, **changed, fits=fits)
 
     @staticmethod
     def of(data: HankelData, device: torch.device, terms: Terms = Terms()) -> DataRows:  # noqa: B008
@@ -129,7 +160,7 @@ class DataRows:
                 "(dropped), relative to the largest."
             )
         basis = space.basis.to(device)
-        stacked = torch.cat([m.to(device=device, dtype=torch.float64) for m in data.matrices])
+        stacked = data.stacked.to(device)
         rows = _InRowSpace.apply(stacked, basis) if carries_derivative(data.matrices) else stacked @ basis
         Up, Yp, Uf, Yf = rows.split([len(m) for m in data.matrices])
         u_ref = len(Up) + len(Yp)
@@ -157,11 +188,30 @@ class DataRows:
         Eq_theta = torch.cat(places) if places else torch.arange(0)
         return DataRows(
             *(Up, Yp, Uf, Yf, torch.cat(parts), Eq, Eq_theta.to(device), *_eliminate(Eq.detach())),
-            charged=0 if terms.identity else space.rank_W,
+            charged=(torch.arange(space.rank, device=device) >= (0 if terms.identity else space.rank_W)).double(),
+            is_identity=terms.identity,
             tracking=tuple(tracking),
             fits=tuple(fits),
             n_theta=n_theta,
         )
+
+
+#: The fields that depend on the data.
+_OF_DATA = ("Up", "Yp", "Uf", "Yf", "C", "Eq", "Eq_pinv", "Z", "Eq_range", "charged")
+
+
+def _padded(rows: DataRows, more: int) -> DataRows:
+    """Return the rows with `more` coordinates that meet none of them."""
+    pad = torch.nn.functional.pad
+    wide: dict[str, Any] = {name: pad(getattr(rows, name), (0, more)) for name in ("Up", "Yp", "Uf", "Yf", "C", "Eq")}
+    return replace(
+        rows,
+        **wide,
+        Eq_pinv=pad(rows.Eq_pinv, (0, 0, 0, more)),
+        Z=torch.block_diag(rows.Z, torch.eye(more, dtype=rows.Z.dtype, device=rows.Z.device)),
+        charged=pad(rows.charged, (0, more), value=1.0),
+        fits=tuple(replace(fit, rows=pad(fit.rows, (0, more))) for fit in rows.fits),
+    )
 
 
 def _eliminate(Eq: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:

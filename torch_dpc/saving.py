@@ -37,7 +37,8 @@ def save_layer(layer: nn.Module, path: str | os.PathLike[str], *, data: bool = F
     torch_files = _safetensors()
     writer = _Writer()
     held = layer.data
-    assert isinstance(held, HankelData)
+    if not isinstance(held, HankelData):
+        raise ValueError("a layer on a batch of data sets cannot be saved: save one layer for each.")
     if data:
         held.require_windows()
     text = {

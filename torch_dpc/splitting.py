@@ -20,9 +20,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .feasible_set import FeasibleSet
 from .linear import times
 from .projected_system import solve_system
+from .sets.feasible import FeasibleSet
 
 #: Splitting steps before Newton.
 SPLITTING_STEPS = 20
@@ -64,16 +64,24 @@ def scale_of(G: Tensor, sets: FeasibleSet) -> Tensor:
     return sets.largest_of_group(diagonal).clamp_min(float(least))
 
 
-def solve_convex(G: Tensor, Ct: Tensor, v0: Tensor, sets: FeasibleSet, gamma: Tensor) -> Found:
+def resolvent_of(G: Tensor, gamma: Tensor) -> Tensor:
+    """Return (G + diag gamma)^-1, which a step of the splitting needs, `(..., N, N)`."""
+    root = gamma.sqrt()
+    scaled = G / root[:, None] / root + torch.eye(len(root), dtype=G.dtype, device=G.device)
+    return torch.cholesky_inverse(torch.linalg.cholesky(scaled)) / root[:, None] / root
+
+
+def solve_convex(G: Tensor, Ct: Tensor, resolvent: Tensor, v0: Tensor, sets: FeasibleSet, gamma: Tensor) -> Found:
     """Solve every sample.
 
     Args:
         G, Ct: `(N, N)` and `(N, n_x)`, or one a sample.
+        resolvent: of G and gamma, likewise.
         v0: unconstrained minimisers, `(B, N)`; more batch dimensions where the sets have them.
         sets: all sets, in part order like G and v0.
         gamma: the scale of the multipliers, `(N,)`.
     """
-    lam = _split(G, v0, sets, gamma)
+    lam = _split(resolvent, v0, sets, gamma)
     lam, iterations, residual = _newton(G, v0, sets, gamma, lam)
     found = Found(lam, iterations + SPLITTING_STEPS, residual, torch.zeros_like(v0))
     bad = residual > GOOD
@@ -91,18 +99,14 @@ def solve_convex(G: Tensor, Ct: Tensor, v0: Tensor, sets: FeasibleSet, gamma: Te
     return found
 
 
-def _split(G: Tensor, v0: Tensor, sets: FeasibleSet, gamma: Tensor) -> Tensor:
+def _split(resolvent: Tensor, v0: Tensor, sets: FeasibleSet, gamma: Tensor) -> Tensor:
     """Return multipliers after a few steps of Douglas-Rachford splitting."""
-    root = gamma.sqrt()
-    values, vectors = torch.linalg.eigh(G / root[:, None] / root)
-    shrink = 1 / (1 + values.clamp_min(0.0))
     state = v0
     for _ in range(SPLITTING_STEPS):
         nearest = sets.prox(state, gamma)
         behind = 2 * nearest - state
         # The affine map's resolvent: (G + gamma) lam = v0 - behind, and v = behind + gamma lam.
-        lam = times(vectors, shrink * times(vectors.mT, (v0 - behind) / root)) / root
-        state = nearest + gamma * lam
+        state = nearest + gamma * times(resolvent, v0 - behind)
     return (state - sets.prox(state, gamma)) / gamma
 
 

@@ -132,9 +132,6 @@ class FiniteDifferenceAttack(ProjectedGradientAttack):
         directions: random directions in place of every entry of the window: fewer queries, a rougher gradient.
         options: `step_size`, `momentum` and `restarts` of projected gradient.
 
-    Attributes:
-        n_queries: windows asked for so far, by all calls.
-
     Example:
         >>> import torch
         >>> import torch_dpc as dpc
@@ -168,7 +165,7 @@ class FiniteDifferenceAttack(ProjectedGradientAttack):
 
     @property
     def n_queries(self) -> int:
-        """Windows asked for so far."""
+        """Windows asked for so far, by all calls."""
         return self.layer.n_queries  # type: ignore[return-value]
 
     def _objective(self, *call: Any, generator: torch.Generator | None) -> Objective:
@@ -187,9 +184,6 @@ class RandomSearchAttack:
         cost: psi, a callable of something with the planned `u`.
         budget: the admissible perturbations.
         queries: windows asked for, a sample; the first is the unattacked one.
-
-    Attributes:
-        n_queries: windows asked for so far, by all calls.
     """
 
     def __init__(self, controller: Callable[..., Any], cost: Any, budget: Budget, queries: int = 100):
@@ -198,7 +192,7 @@ class RandomSearchAttack:
 
     @property
     def n_queries(self) -> int:
-        """Windows asked for so far."""
+        """Windows asked for so far, by all calls."""
         return self.controller.n_queries
 
     def __call__(

@@ -5,11 +5,13 @@ from __future__ import annotations
 from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import cast
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 
-from .sets import Box, ConvexSet, Part
+from .base import ConvexSet, Part
+from .box import Box
 
 #: The Jacobian of the projection, part by part: its diagonal `(..., groups, size)` where the set is separable, blocks
 #: `(..., groups, size, size)` otherwise.
@@ -42,6 +44,10 @@ class FeasibleSet:
             parts += [(leaf, start + places) for leaf, places in owner.parts(steps, channels)]
             start += steps * channels
         return FeasibleSet(parts)
+
+    def snapshot(self) -> FeasibleSet:
+        """Return the same sets with the parameters that they have now."""
+        return FeasibleSet([(cast(ConvexSet, _snapshot(owner)), places) for owner, places in self.parts])
 
     @cached_property
     def order(self) -> Tensor:
@@ -221,6 +227,16 @@ class FeasibleSet:
     @staticmethod
     def _group(x: Tensor, at: slice, shape: tuple[int, ...]) -> Tensor:
         return x[..., at].unflatten(-1, shape)
+
+
+def _snapshot(module: nn.Module) -> nn.Module:
+    """Return a copy that shares the tensors of a module, but not the places that hold them."""
+    copy = object.__new__(type(module))
+    copy.__dict__.update(module.__dict__)
+    copy.__dict__["_parameters"] = dict(module._parameters)
+    copy.__dict__["_buffers"] = dict(module._buffers)
+    copy.__dict__["_modules"] = {k: None if m is None else _snapshot(m) for k, m in module._modules.items()}
+    return copy
 
 
 def _joined(parts: list[Tensor]) -> Tensor:
