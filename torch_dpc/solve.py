@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from . import kernels
 from .active_set import solve_active
 from .checks import as_data, is_finite
 from .dual_active_set import SOLVED_FLAG, Daqp, sense_of, solve_daqp
@@ -26,11 +27,11 @@ from .reduction import Reduction
 
 #: A sample is accepted when F, relative to its own terms, is at most this.
 ACCEPTED = 1e-8
-#: DAQP's own multipliers are taken as they are up to this residual, and polished above it.
+#: One sample's multipliers are taken as they are up to this residual; above it the batched way has its turn.
 AS_GOOD_AS_POLISHED = 1e-11
-#: Up to this many samples on the CPU, NumPy and DAQP take one after the other.
+#: Up to this many samples on the CPU, NumPy takes one after the other.
 FEW = 3
-#: On the CPU, DAQP takes batches up to this size and Newton larger ones.
+#: Without the compiled kernels, DAQP takes batches up to this size on the CPU and Newton larger ones.
 DAQP_BATCH = 16
 
 Engine = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], ActiveSetResult]
@@ -94,6 +95,10 @@ class Solver:
         return Optimality(self.reduction, SINGLE)
 
     @cached_property
+    def _G(self) -> np.ndarray:
+        return self.reduction.G.numpy()
+
+    @cached_property
     def _daqp(self) -> Daqp | None:
         return Daqp(self.reduction.Ct) if self.reduction.Ct.ndim == 2 else None
 
@@ -115,9 +120,9 @@ class Solver:
             InfeasibleError, SolveError: with `on_failure="raise"`, if a sample has no accepted solution.
         """
         daqp_first = self._is_daqp_first(theta)
-        if daqp_first and self._are_few(theta, lower, upper):
+        if self._are_few(theta, lower, upper) and (daqp_first or kernels.serve(theta)):
             samples = theta.numpy().reshape(-1, theta.shape[-1])
-            quick = self._one_by_one(samples, lower.numpy(), upper.numpy(), theta.shape[:-1])
+            quick = self._one_by_one(samples, lower.numpy(), upper.numpy(), theta.shape[:-1], daqp_first)
             if quick is not None:
                 return quick
         shared_bounds = lower.ndim == upper.ndim == 1
@@ -154,10 +159,11 @@ class Solver:
         return solved
 
     def _is_daqp_first(self, theta: Tensor) -> bool:
-        """DAQP is faster for a few problems with one matrix, Newton for many; `scripts/benchmark.py` shows where."""
-        count = theta.numel() // theta.shape[-1]
-        suits = theta.device.type == "cpu" and count <= DAQP_BATCH and self._daqp is not None
-        return self.engine == "daqp" or (self.engine == "auto" and suits)
+        """Newton is faster, but without its kernel for a few problems with one matrix."""
+        if self.engine != "auto":
+            return self.engine == "daqp"
+        few = theta.device.type == "cpu" and theta.numel() <= DAQP_BATCH * theta.shape[-1]
+        return few and self._daqp is not None and not kernels.serve(theta)
 
     def _are_few(self, theta: Tensor, lower: Tensor, upper: Tensor) -> bool:
         """Whether NumPy can take the samples one by one: few, on the CPU, and nothing to look at sample by sample."""
@@ -178,35 +184,35 @@ class Solver:
         return Solved(judged.v, found.lam, judged.active, torch.stack([i.double() for i in info], dim=-1))
 
     def _one_by_one(
-        self, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray, batch: tuple[int, ...]
+        self, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray, batch: tuple[int, ...], daqp: bool
     ) -> Planned | None:
-        """Run DAQP and judge its own multipliers, in NumPy; None if one sample does not convince."""
-        sense = sense_of(lower == upper)
+        """Solve and judge the samples in NumPy; None if one of them does not convince."""
+        if self.reduction.G.ndim > 2 or (batch and len(theta) == 0):
+            return None
+        sense = sense_of(lower == upper) if daqp else None
         found = []
         for sample in theta:
             one = self._one(sample, lower, upper, sense)
             if one is None:
                 return None
             found.append(one)
-        if not batch:
-            v, *rest = found[0]
-        elif found:
-            v, *rest = (np.stack(x).reshape((*batch, -1)) for x in zip(*found, strict=True))
-        else:
-            return None
+        v, *rest = (np.stack(x).reshape((*batch, -1)) for x in zip(*found, strict=True)) if batch else found[0]
         u, y = self.sizes.split(v)
         return Planned(*map(torch.from_numpy, (u, y, *rest)))
 
     def _one(
-        self, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray, sense: np.ndarray
+        self, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray, sense: np.ndarray | None
     ) -> tuple[np.ndarray, ...] | None:
-        """Return v, lam, active and info of one sample, as `Solved` describes them."""
-        if self._daqp is None:
-            return None
+        """Return v, lam, active and info of one sample, as `Solved` describes them; by DAQP where `sense` is given."""
         a0, v0 = self._single.unconstrained(theta)
-        lam, flag, iterations = self._daqp.solve(lower - v0, upper - v0, sense)
+        if sense is None:
+            (lam,), (iterations,), (solved,) = kernels.solve_boxes(self._G, v0[None], lower, upper)
+        else:
+            assert self._daqp is not None
+            lam, flag, iterations = self._daqp.solve(lower - v0, upper - v0, sense)
+            solved = flag == SOLVED_FLAG
         v, residual, active, n_active, n_weak = self._single.judge(theta, a0, v0, lam, lower, upper)
-        if not (flag == SOLVED_FLAG and residual <= AS_GOOD_AS_POLISHED):  # NaN is not either
+        if not (solved and residual <= AS_GOOD_AS_POLISHED):  # NaN is not either
             return None
         return v, lam, active, np.array((Status.SOLVED, iterations, residual, n_active, n_weak), dtype=np.float64)
 

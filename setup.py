@@ -1,0 +1,9 @@
+"""The one thing setup.cfg cannot say: the kernels in C, which torch_dpc works without, slower."""
+
+from setuptools import Extension, setup
+
+setup(
+    ext_modules=[
+        Extension("torch_dpc._kernels", ["torch_dpc/_kernels.c"], extra_compile_args=["-O3"], optional=True),
+    ]
+)
