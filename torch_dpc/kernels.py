@@ -80,6 +80,16 @@ def adjoint(G: Tensor, active: Tensor, v_bar: Tensor, lam_bar: Tensor | None) ->
     return torch.from_numpy(out), torch.from_numpy(trusted)
 
 
+def adjoint_of_one(
+    G: np.ndarray, active: np.ndarray, v_bar: np.ndarray, lam_bar: np.ndarray | None
+) -> np.ndarray | None:
+    """Return what `adjoint` does for one sample `(N,)`; None where it is not to be trusted."""
+    out, trusted = np.empty((1, len(v_bar))), np.empty(1, dtype=bool)
+    lam_row = None if lam_bar is None else lam_bar[None]
+    _kernels.adjoint(G, active[None], v_bar[None], lam_row, out, trusted, STANDING_OUT, 1)
+    return out[0] if trusted[0] else None
+
+
 def as_array(tensor: Tensor) -> np.ndarray:
     """Return a tensor's numbers as a kernel reads them."""
     return tensor.detach().contiguous().numpy()

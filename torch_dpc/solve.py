@@ -95,8 +95,9 @@ class Solver:
         return Optimality(self.reduction, SINGLE)
 
     @cached_property
-    def _G(self) -> np.ndarray:
-        return self.reduction.G.numpy()
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A_theta, C and G of one problem on the CPU."""
+        return self.reduction.A_theta.numpy(), self.reduction.rows.C.numpy(), self.reduction.G.contiguous().numpy()
 
     @cached_property
     def _daqp(self) -> Daqp | None:
@@ -206,7 +207,7 @@ class Solver:
         """Return v, lam, active and info of one sample, as `Solved` describes them; by DAQP where `sense` is given."""
         a0, v0 = self._single.unconstrained(theta)
         if sense is None:
-            (lam,), (iterations,), (solved,) = kernels.solve_boxes(self._G, v0[None], lower, upper)
+            (lam,), (iterations,), (solved,) = kernels.solve_boxes(self.arrays[2], v0[None], lower, upper)
         else:
             assert self._daqp is not None
             lam, flag, iterations = self._daqp.solve(lower - v0, upper - v0, sense)
