@@ -29,7 +29,7 @@ from .linear import flatten_batch, lead_all, outer, times
 from .projected_kkt import FullAdjoint
 from .reduction import Reduction
 from .solve import Planned, Solver
-from .transforms import carries_derivative, is_grads_batched, is_plain
+from .transforms import apply_function, carries_derivative, is_grads_batched, is_plain
 
 
 def solve_reduced(solver: Solver, theta: Tensor, reduction: Reduction, lower: Tensor, upper: Tensor) -> Planned:
@@ -39,7 +39,7 @@ def solve_reduced(solver: Solver, theta: Tensor, reduction: Reduction, lower: Te
         if not carries_derivative((theta, lower, upper)) and is_plain(theta):
             return solver.solve(theta, lower, upper)  # a third of the time of a small call is the Function's
         matrices = (None, None, None)  # constants: those of the solver will do, and need not be saved
-    return Planned(*SolveReduced.apply(theta, *matrices, lower, upper, solver))
+    return Planned(*apply_function(SolveReduced, theta, *matrices, lower, upper, solver))
 
 
 class SolveReduced(torch.autograd.Function):
@@ -68,7 +68,8 @@ class SolveReduced(torch.autograd.Function):
         ctx.set_materialize_grads(False)
         ctx.solver = solver
         ctx.may_fail = solver.on_failure != "raise"
-        saved = (None if A is None else theta, A, C, G, lower, upper, lam, active, info)
+        ctx.bound_shapes = lower.shape, upper.shape
+        saved = (lam, active, info) if A is None else (lam, active, info, theta, A, C, G)
         ctx.save_for_backward(*saved)
         ctx.save_for_forward(*saved)
 
@@ -79,13 +80,13 @@ class SolveReduced(torch.autograd.Function):
         bars = [bar for bar in (u_bar, y_bar, lam_bar) if bar is not None]
         if not bars:
             return (None,) * 7
-        theta, A, C, G, lower, upper, lam, active, info = ctx.saved_tensors
+        lam, active, info, *matrices = ctx.saved_tensors
         solver, need = ctx.solver, ctx.needs_input_grad
         at_last = not torch.is_grad_enabled() and all(map(is_plain, bars))  # nothing will be derived again
-        if at_last and lam.ndim == 1 and not any(need[1:]) and not ctx.may_fail and kernels.serve(lam):
-            quick = _theta_bar(solver, active, u_bar, y_bar, lam_bar)
-            if quick is not None:
-                return quick, *(None,) * 6
+        if at_last and lam.ndim == 1 and not (ctx.may_fail or any(need[1:])):
+            theta_bar = _of_one(solver, active, u_bar, y_bar, lam_bar)
+            if theta_bar is not None:
+                return theta_bar, *(None,) * 6
         v_bar = solver.sizes.join(u_bar, y_bar, lam)
         if ctx.may_fail:  # samples without a solution add nothing, whatever came back for their NaN
             solved = info[..., :1] == Status.SOLVED
@@ -93,7 +94,7 @@ class SolveReduced(torch.autograd.Function):
             lam_bar = None if lam_bar is None else torch.where(solved, lam_bar, 0.0)
         if solver.full is not None:
             return FullAdjoint.apply(v_bar, lam_bar, active, solver.full), *(None,) * 6
-        A, C, G = _matrices(solver, A, C, G)
+        theta, A, C, G = matrices or _constants(solver)
         if is_grads_batched(v_bar):
             v0_bar = adjoint_dense(G, active, v_bar, lam_bar)
         else:  # the Function only where something will be derived again
@@ -107,8 +108,8 @@ class SolveReduced(torch.autograd.Function):
         lower_bar = upper_bar = None
         if need[4] or need[5]:
             b_bar = torch.where(active, v_bar - v0_bar, 0.0)
-            lower_bar = torch.where(lam < 0, b_bar, 0.0).sum_to_size(lower.shape)
-            upper_bar = torch.where(lam < 0, 0.0, b_bar).sum_to_size(upper.shape)
+            lower_bar = torch.where(lam < 0, b_bar, 0.0).sum_to_size(ctx.bound_shapes[0])
+            upper_bar = torch.where(lam < 0, 0.0, b_bar).sum_to_size(ctx.bound_shapes[1])
         return theta_bar, A_bar, C_bar, G_bar, lower_bar, upper_bar, None
 
     @staticmethod
@@ -122,8 +123,8 @@ class SolveReduced(torch.autograd.Function):
         upper_t: Tensor | None,
         _solver: Any,
     ) -> tuple[Tensor | None, ...]:
-        theta, A, C, G, _, _, lam, active, info = ctx.saved_tensors
-        A, C, G = _matrices(ctx.solver, A, C, G)
+        lam, active, info, *matrices = ctx.saved_tensors
+        theta, A, C, G = matrices or _constants(ctx.solver)
         solved = info[..., :1] == Status.SOLVED
         free = torch.zeros_like(lam)
         if theta_t is not None:
@@ -158,25 +159,22 @@ class SolveReduced(torch.autograd.Function):
         return outputs, (0,) * len(outputs)
 
 
-def _matrices(solver: Solver, A: Tensor | None, C: Tensor | None, G: Tensor | None) -> tuple[Tensor, Tensor, Tensor]:
-    """Return A, C and G as they were given, with their graph, or as the solver has them."""
-    if A is None or C is None or G is None:
-        return solver.reduction.A_theta, solver.reduction.rows.C, solver.reduction.G
-    return A, C, G
+def _constants(solver: Solver) -> tuple[None, Tensor, Tensor, Tensor]:
+    """Return A, C and G where they are constants; theta, which their derivatives alone need, stays out."""
+    return None, solver.reduction.A_theta, solver.reduction.rows.C, solver.reduction.G
 
 
-def _theta_bar(
+def _of_one(
     solver: Solver, active: Tensor, u_bar: Tensor | None, y_bar: Tensor | None, lam_bar: Tensor | None
 ) -> Tensor | None:
-    """Return theta_bar of one sample, in NumPy; None where its system is not to be trusted."""
-    if solver.full is not None or solver.reduction.G.ndim > 2:
+    """Return theta_bar of one sample by NumPy and the kernel; None where that does not do."""
+    if solver.full is not None or solver.reduction.G.ndim > 2 or not kernels.serve(active):
         return None
-    v_bar, split = np.zeros(len(active)), solver.sizes.u
-    if u_bar is not None:
-        v_bar[:split] = u_bar.numpy().reshape(-1)
-    if y_bar is not None:
-        v_bar[split:] = y_bar.numpy().reshape(-1)
-    lam_array = None if lam_bar is None else lam_bar.contiguous().numpy()
+    v_bar, n_u = np.zeros(len(active)), solver.sizes.u
+    for bar, part in ((u_bar, v_bar[:n_u]), (y_bar, v_bar[n_u : n_u + solver.sizes.y])):
+        if bar is not None:
+            part[:] = bar.numpy().reshape(-1)
+    lam_array = None if lam_bar is None else kernels.as_array(lam_bar)
     A, C, G = solver.arrays
     v0_bar = kernels.adjoint_of_one(G, active.numpy(), v_bar, lam_array)
     return None if v0_bar is None else torch.from_numpy((v0_bar @ C) @ A)

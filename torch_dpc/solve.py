@@ -121,9 +121,8 @@ class Solver:
             InfeasibleError, SolveError: with `on_failure="raise"`, if a sample has no accepted solution.
         """
         daqp_first = self._is_daqp_first(theta)
-        if self._are_few(theta, lower, upper) and (daqp_first or kernels.serve(theta)):
-            samples = theta.numpy().reshape(-1, theta.shape[-1])
-            quick = self._one_by_one(samples, lower.numpy(), upper.numpy(), theta.shape[:-1], daqp_first)
+        if theta.numel() <= FEW * theta.shape[-1]:
+            quick = self._one_by_one(theta, lower, upper, daqp_first)
             if quick is not None:
                 return quick
         shared_bounds = lower.ndim == upper.ndim == 1
@@ -166,12 +165,6 @@ class Solver:
         few = theta.device.type == "cpu" and theta.numel() <= DAQP_BATCH * theta.shape[-1]
         return few and self._daqp is not None and not kernels.serve(theta)
 
-    def _are_few(self, theta: Tensor, lower: Tensor, upper: Tensor) -> bool:
-        """Whether NumPy can take the samples one by one: few, on the CPU, and nothing to look at sample by sample."""
-        shared = lower.ndim == upper.ndim == 1 and self.reduction.rows.Eq_range is None
-        few = theta.numel() <= FEW * theta.shape[-1] and theta.device.type == "cpu"
-        return shared and few and math.isfinite(theta.numpy().sum())
-
     def _engine(self, daqp: bool) -> Engine:
         return partial(solve_daqp, workspace=self._daqp) if daqp else solve_newton
 
@@ -184,34 +177,38 @@ class Solver:
         info = [failed * Status.FAILED, found.iterations, judged.residual, judged.n_active, judged.n_weakly_active]
         return Solved(judged.v, found.lam, judged.active, torch.stack([i.double() for i in info], dim=-1))
 
-    def _one_by_one(
-        self, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray, batch: tuple[int, ...], daqp: bool
-    ) -> Planned | None:
-        """Solve and judge the samples in NumPy; None if one of them does not convince."""
-        if self.reduction.G.ndim > 2 or (batch and len(theta) == 0):
+    def _one_by_one(self, theta: Tensor, lower: Tensor, upper: Tensor, daqp_first: bool) -> Planned | None:
+        """Solve and judge the samples in NumPy; None where that does not do, or one of them does not convince."""
+        if theta.device.type != "cpu" or not (daqp_first or kernels.serve(theta)):
             return None
-        sense = sense_of(lower == upper) if daqp else None
-        found = []
-        for sample in theta:
-            one = self._one(sample, lower, upper, sense)
+        plain = lower.ndim == upper.ndim == 1 and self.reduction.G.ndim == 2 and self.reduction.rows.Eq_range is None
+        batch, sample = theta.shape[:-1], theta.numpy()
+        if not plain or not math.isfinite(sample.sum()):
+            return None
+        bounds = lower.numpy(), upper.numpy()
+        if not batch:
+            one = self._one(sample, *bounds, daqp_first)
             if one is None:
                 return None
-            found.append(one)
-        v, *rest = (np.stack(x).reshape((*batch, -1)) for x in zip(*found, strict=True)) if batch else found[0]
-        u, y = self.sizes.split(v)
-        return Planned(*map(torch.from_numpy, (u, y, *rest)))
+            v, *rest = one
+        else:
+            several = [self._one(row, *bounds, daqp_first) for row in sample.reshape(-1, sample.shape[-1])]
+            found = [one for one in several if one is not None]
+            if not found or len(found) < len(several):
+                return None
+            v, *rest = (np.stack(x).reshape((*batch, -1)) for x in zip(*found, strict=True))
+        return Planned(*map(torch.from_numpy, (*self.sizes.split(v), *rest)))
 
     def _one(
-        self, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray, sense: np.ndarray | None
+        self, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray, daqp_first: bool
     ) -> tuple[np.ndarray, ...] | None:
-        """Return v, lam, active and info of one sample, as `Solved` describes them; by DAQP where `sense` is given."""
+        """Return v, lam, active and info of one sample, as `Solved` describes them; None if they do not convince."""
         a0, v0 = self._single.unconstrained(theta)
-        if sense is None:
-            (lam,), (iterations,), (solved,) = kernels.solve_boxes(self.arrays[2], v0[None], lower, upper)
-        else:
-            assert self._daqp is not None
-            lam, flag, iterations = self._daqp.solve(lower - v0, upper - v0, sense)
+        if daqp_first and self._daqp is not None:
+            lam, flag, iterations = self._daqp.solve(lower - v0, upper - v0, sense_of(lower == upper))
             solved = flag == SOLVED_FLAG
+        else:
+            (lam,), (iterations,), (solved,) = kernels.solve_boxes(self.arrays[2], v0[None], lower, upper)
         v, residual, active, n_active, n_weak = self._single.judge(theta, a0, v0, lam, lower, upper)
         if not (solved and residual <= AS_GOOD_AS_POLISHED):  # NaN is not either
             return None
