@@ -8,11 +8,12 @@
  * active_set.py hold the same mathematics for other devices. G is symmetric, one for all samples or one each. Samples
  * are independent and each is computed by one thread in one order: results do not depend on threads or neighbours.
  *
- * The triangle R (R'R = G_AA, rows in the order of the list A) lies row by row, and the right-hand side is its last
- * column: factoring solves R'y = rhs in passing. Vectors are GCC's, which clang knows too.
+ * A system is solved by elimination in the order of the list A, U x = y with U = D L' for G_AA = L D L'. U lies row by
+ * row, and y is its last column: eliminating solves for it in passing. Vectors are GCC's, which clang knows too.
  */
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
+#include <float.h>
 #include <math.h>
 #include <stdint.h>
 #include <stdlib.h>
@@ -28,11 +29,12 @@
 #pragma GCC diagnostic ignored "-Wpsabi" /* vectors are passed between inlined functions alone */
 #endif
 #define INLINE static inline __attribute__((always_inline))
-enum { WIDTH = 8, BLOCK = 4 * WIDTH }; /* columns of R are worked on by blocks */
+enum { WIDTH = 8, BLOCK = 4 * WIDTH }; /* columns of U are worked on by blocks */
 typedef double vec __attribute__((vector_size(8 * sizeof(double))));
+typedef int64_t mask __attribute__((vector_size(8 * sizeof(int64_t)))); /* of comparisons: 0 or -1 */
 
 /* Sweeps of coordinate descent before the first step, and before another try where the sets cycle. */
-enum { SWEEPS = 4, SWEEPS_AGAIN = 30, TRIES = 3 };
+enum { SWEEPS = 1, SWEEPS_AGAIN = 30, TRIES = 3 };
 /* Samples that a thread takes at once, and how many a batch needs before a second thread is worth its start. */
 enum { CHUNK = 16, ENOUGH = 96 };
 
@@ -48,115 +50,115 @@ INLINE vec spread(double s) { return (vec){s, s, s, s, s, s, s, s}; }
 
 INLINE double sum(vec x) { return ((x[0] + x[4]) + (x[2] + x[6])) + ((x[1] + x[5]) + (x[3] + x[7])); }
 
+INLINE int any(mask m) { return ((m[0] | m[4]) | (m[2] | m[6]) | (m[1] | m[5]) | (m[3] | m[7])) != 0; }
+
 INLINE double clip(double x, double lower, double upper) { return x > upper ? upper : x < lower ? lower : x; }
 
 /* --- one system on the active rows ------------------------------------------------------------------------------- */
 
 typedef struct {
+    void *block, *U_block; /* what holds all below, and U */
     int64_t n;       /* N */
-    int64_t room;    /* rows and columns of R that fit, the right-hand side included; a multiple of BLOCK */
-    double *R;       /* (room, room), upper triangular */
-    double *inverse; /* (N + 1) of the diagonal of R */
-    double *rhs;     /* (N) right-hand side, by row of G */
-    double *x;       /* (N, rounded up) the solution, in the order of `rows` */
-    double *v, *lam; /* (N) */
+    int64_t room;    /* rows and columns of U that fit, the right-hand side included; a multiple of BLOCK */
+    double *U;       /* (room, room), upper triangular */
     int64_t *rows;   /* (N) the active rows */
-    signed char *sides;       /* what the two below lie in; they change places */
-    signed char *side, *next; /* (N) -1, 0 or 1: where each row is held */
+    double *inverse; /* (N) of the diagonal of U */
+    double *rhs;     /* (N) right-hand side, by row of G */
+    double *x;       /* (N) the solution, in the order of `rows` */
+    double *v, *lam; /* (N) */
+    double *lower, *upper, *below, *above; /* (N) the bounds, and what v + lam must pass for a row to be held */
+    double *per_own;                       /* (N) 1 / G_ii, or 0 where nothing moves the row */
+    const double *bounds_of, *own_of;      /* whose lower bounds and G these are */
+    int64_t *side, *next;                  /* (N) 1, 0 or -1: held at the upper bound, free, held at the lower one */
 } Scratch;
 
 static int64_t rounded(int64_t n, int64_t to) { return (n + to - 1) / to * to; }
 
-static void scratch_free(Scratch *s) {
-    free(s->R);
-    free(s->inverse);
-    free(s->rows);
-    free(s->sides);
+enum { LINE = 64 }; /* bytes of a cache line: a vector that crosses one costs twice */
+
+/* `count` items of 8 bytes; `*block` is what to free. */
+static void *aligned(void **block, int64_t count) {
+    *block = malloc((size_t)count * 8 + LINE);
+    return *block ? (char *)*block + (LINE - (uintptr_t)*block % LINE) : NULL;
 }
 
+static void scratch_free(Scratch *s) {
+    free(s->U_block);
+    free(s->block);
+}
+
+/* All vectors are longer than N by up to a block of zeros. */
 static int scratch_new(Scratch *s, int64_t n) {
     const int64_t wide = rounded(n + 1, BLOCK);
     *s = (Scratch){.n = n};
-    s->inverse = calloc((size_t)(5 * wide), sizeof(double));
-    s->rows = malloc((size_t)wide * sizeof(int64_t));
-    s->sides = malloc((size_t)(2 * wide));
-    if (!s->inverse || !s->rows || !s->sides) return 0;
-    s->rhs = s->inverse + wide;
-    s->x = s->rhs + wide;
-    s->v = s->x + wide;
-    s->lam = s->v + wide;
-    s->side = s->sides;
-    s->next = s->sides + wide;
+    s->rows = aligned(&s->block, 13 * wide);
+    if (!s->rows) return 0;
+    memset(s->rows, 0, (size_t)(13 * wide) * sizeof(double));
+    double *next = (double *)(s->rows + wide);
+    double **parts[] = {&s->inverse, &s->rhs,   &s->x,     &s->v,     &s->lam,
+                        &s->lower,   &s->upper, &s->below, &s->above, &s->per_own};
+    for (size_t i = 0; i < sizeof parts / sizeof *parts; i++, next += wide) *parts[i] = next;
+    s->side = (int64_t *)next;
+    s->next = s->side + wide;
     return 1;
 }
 
-/* Make room for k rows and a right-hand side; return whether what R held is still there, or -1 without memory. */
+/* Make room for k rows and a right-hand side; return whether what U held is still there, or -1 without memory. */
 static int make_room(Scratch *s, int64_t k) {
     if (k < s->room) return 1;
     const int64_t room = rounded(k + k / 2 + 1, BLOCK);
-    free(s->R);
-    s->R = malloc((size_t)(room * room) * sizeof(double));
-    s->room = s->R ? room : 0;
-    return s->R ? 0 : -1;
+    free(s->U_block);
+    s->U = aligned(&s->U_block, room * room);
+    s->room = s->U ? room : 0;
+    return s->U ? 0 : -1;
 }
 
-/* Compute the columns from `first` on of R, and y with R'y = rhs as column k. Return whether every row of G_AA stands
- * out of the span of those before it by the fraction `standing_out` of its length. */
+/* Subtract from `count` vectors of row i of U, at column c, what the rows above contribute. */
+INLINE void eliminate(const int count, const Scratch *s, int64_t i, int64_t c) {
+    const int64_t ld = s->room;
+    const double *above = s->U + c, *column = s->U + i, *inverse = s->inverse;
+    vec a[4], b[4];
+    for (int t = 0; t < count; t++) a[t] = load(above + i * ld + WIDTH * t), b[t] = spread(0.0);
+    int64_t l = 0;
+    for (; l + 1 < i; l += 2) { /* two sums: one would wait for itself */
+        const vec p = spread(column[l * ld] * inverse[l]), q = spread(column[l * ld + ld] * inverse[l + 1]);
+        for (int t = 0; t < count; t++) a[t] -= p * load(above + l * ld + WIDTH * t);
+        for (int t = 0; t < count; t++) b[t] -= q * load(above + l * ld + ld + WIDTH * t);
+    }
+    if (l < i) {
+        const vec p = spread(column[l * ld] * inverse[l]);
+        for (int t = 0; t < count; t++) a[t] -= p * load(above + l * ld + WIDTH * t);
+    }
+    for (int t = 0; t < count; t++) store(s->U + i * ld + c + WIDTH * t, a[t] + b[t]);
+}
+
+/* Compute the columns from `first` on of U, and y as its column k. Return whether every row of Ct stands out of the
+ * span of those before it by the fraction `standing_out` of its length. */
 INLINE int factor(Scratch *s, const double *G, int64_t k, int64_t first, double standing_out) {
-    const int64_t ld = s->room, end = rounded(k + 1, BLOCK);
-    const int64_t *rows = s->rows;
+    const int64_t end = rounded(k + 1, BLOCK), *rows = s->rows;
     for (int64_t i = 0; i < k; i++) {
-        double *Ri = s->R + i * ld;
+        double *Ui = s->U + i * s->room;
         const double *Gi = G + rows[i] * s->n;
-        const int64_t begin = (i > first ? i : first) / WIDTH * WIDTH; /* columns left of i come out as rounding */
-        for (int64_t c = begin; c < k; c++) Ri[c] = Gi[rows[c]];
-        Ri[k] = s->rhs[rows[i]];
-        for (int64_t c = k + 1; c < end; c++) Ri[c] = 0.0;
-        for (int64_t c = begin; c < end; c += BLOCK) {
-            const int64_t last = end - c < BLOCK ? (end - c) / WIDTH : BLOCK / WIDTH;
-            const double *Rl = s->R + c;
-            if (last == 4) {
-                vec a0 = load(Ri + c), a1 = load(Ri + c + 8), a2 = load(Ri + c + 16), a3 = load(Ri + c + 24);
-                vec b0 = spread(0.0), b1 = b0, b2 = b0, b3 = b0;
-                int64_t l = 0;
-                for (; l + 1 < i; l += 2, Rl += 2 * ld) {
-                    const vec p = spread(s->R[l * ld + i]), q = spread(s->R[l * ld + ld + i]);
-                    a0 -= p * load(Rl), a1 -= p * load(Rl + 8), a2 -= p * load(Rl + 16), a3 -= p * load(Rl + 24);
-                    b0 -= q * load(Rl + ld), b1 -= q * load(Rl + ld + 8);
-                    b2 -= q * load(Rl + ld + 16), b3 -= q * load(Rl + ld + 24);
-                }
-                if (l < i) {
-                    const vec p = spread(s->R[l * ld + i]);
-                    a0 -= p * load(Rl), a1 -= p * load(Rl + 8), a2 -= p * load(Rl + 16), a3 -= p * load(Rl + 24);
-                }
-                store(Ri + c, a0 + b0), store(Ri + c + 8, a1 + b1);
-                store(Ri + c + 16, a2 + b2), store(Ri + c + 24, a3 + b3);
-                continue;
-            }
-            for (int64_t t = 0; t < last; t++) {
-                vec a = load(Ri + c + WIDTH * t), b = spread(0.0);
-                const double *column = Rl + WIDTH * t;
-                int64_t l = 0;
-                for (; l + 1 < i; l += 2) {
-                    a -= spread(s->R[l * ld + i]) * load(column + l * ld);
-                    b -= spread(s->R[l * ld + ld + i]) * load(column + l * ld + ld);
-                }
-                if (l < i) a -= spread(s->R[l * ld + i]) * load(column + l * ld);
-                store(Ri + c + WIDTH * t, a + b);
-            }
-        }
-        if (i >= first) {
-            const double length = Gi[rows[i]];
-            if (!(Ri[i] > standing_out * standing_out * length)) return 0; /* neither is NaN */
-            s->inverse[i] = 1.0 / sqrt(Ri[i]);
-        }
-        const vec scale = spread(s->inverse[i]);
-        for (int64_t c = begin; c < end; c += WIDTH) store(Ri + c, scale * load(Ri + c));
+        /* By whole vectors: what lies left of column i comes out as rounding and is never used. */
+        for (int64_t c = (i > first ? i : first) / WIDTH * WIDTH; c < k; c++) Ui[c] = Gi[rows[c]];
+        Ui[k] = s->rhs[rows[i]];
+        for (int64_t c = k + 1; c < end; c++) Ui[c] = 0.0;
+    }
+    for (int64_t i = 0; i < k; i++) {
+        int64_t c = (i > first ? i : first) / WIDTH * WIDTH;
+        for (; c + 4 * WIDTH <= end; c += 4 * WIDTH) eliminate(4, s, i, c);
+        if (c + 3 * WIDTH == end) eliminate(3, s, i, c);
+        else if (c + 2 * WIDTH == end) eliminate(2, s, i, c);
+        else if (c + WIDTH == end) eliminate(1, s, i, c);
+        if (i < first) continue;
+        const double pivot = s->U[i * s->room + i], length = G[rows[i] * s->n + rows[i]];
+        if (!(pivot > standing_out * standing_out * length)) return 0; /* nor is it NaN */
+        s->inverse[i] = 1.0 / pivot;
     }
     return 1;
 }
 
-/* Solve R x = y, y the column k of R. */
+/* Solve U x = y. */
 INLINE void substitute(Scratch *s, int64_t k) {
     const int64_t ld = s->room, end = rounded(k, WIDTH);
     double *x = s->x;
@@ -165,14 +167,14 @@ INLINE void substitute(Scratch *s, int64_t k) {
         const int64_t here = b + WIDTH < k ? WIDTH : k - b;
         double y[WIDTH];
         for (int64_t i = 0; i < here; i++) {
-            const double *Ri = s->R + (b + i) * ld;
+            const double *Ui = s->U + (b + i) * ld;
             vec a = spread(0.0);
-            for (int64_t c = b + WIDTH; c < end; c += WIDTH) a += load(Ri + c) * load(x + c);
-            y[i] = Ri[k] - sum(a);
+            for (int64_t c = b + WIDTH; c < end; c += WIDTH) a += load(Ui + c) * load(x + c);
+            y[i] = Ui[k] - sum(a);
         }
         for (int64_t i = here - 1; i >= 0; i--) {
             x[b + i] = y[i] * s->inverse[b + i];
-            for (int64_t j = 0; j < i; j++) y[j] -= s->R[(b + j) * ld + b + i] * x[b + i];
+            for (int64_t j = 0; j < i; j++) y[j] -= s->U[(b + j) * ld + b + i] * x[b + i];
         }
     }
 }
@@ -230,19 +232,41 @@ typedef struct {
     int64_t max_steps;
 } Boxes;
 
-/* Improve lam by coordinate descent on 1/2 lam'G lam - ..., and v = v0 - G lam with it. */
+/* Take in the bounds and the diagonal of G; where all samples share them, once. */
+INLINE void take_in(const Boxes *p, Scratch *s) {
+    for (int64_t i = 0; s->own_of != p->G && i < s->n; i++) {
+        const double own = p->G[i * s->n + i];
+        s->per_own[i] = own > DBL_MIN ? 1.0 / own : 0.0;
+    }
+    s->own_of = p->G;
+    if (s->bounds_of == p->lower) return;
+    s->bounds_of = p->lower;
+    for (int64_t i = 0; i < rounded(s->n, WIDTH); i++) {
+        const double lower = i < s->n ? p->lower[i] : -INFINITY, upper = i < s->n ? p->upper[i] : INFINITY;
+        s->lower[i] = lower, s->upper[i] = upper;
+        s->below[i] = lower - p->hysteresis * (1.0 + fabs(lower));
+        s->above[i] = lower == upper ? -INFINITY : upper + p->hysteresis * (1.0 + fabs(upper)); /* tight: always held */
+    }
+}
+
+/* Improve lam by coordinate descent on 1/2 lam'G lam - v0'lam + (support of the box at lam), and v = v0 - G lam. */
 INLINE void descend(const Boxes *p, Scratch *s, int sweeps) {
     const int64_t n = s->n;
     double *restrict v = s->v, *restrict lam = s->lam;
+    const double *restrict lower = s->lower, *restrict upper = s->upper;
     for (int sweep = 0; sweep < sweeps; sweep++) {
         int moved = 0;
         for (int64_t i = 0; i < n; i++) {
-            if (lam[i] == 0.0 && v[i] >= p->lower[i] && v[i] <= p->upper[i]) continue;
-            const double own = p->G[i * n + i], free = v[i] + own * lam[i];
-            const double step = (free - clip(free, p->lower[i], p->upper[i])) / own - lam[i];
-            if (step == 0.0 || !isfinite(step)) continue; /* own = 0: nothing moves this row */
+            const double here = v[i], before = lam[i];
+            if ((before == 0.0) & (here >= lower[i]) & (here <= upper[i])) continue;
             const double *restrict row = p->G + i * n;
-            for (int64_t c = 0; c < n; c++) v[c] -= step * row[c];
+            const double free = here + row[i] * before;
+            const double step = (free - clip(free, lower[i], upper[i])) * s->per_own[i] - before;
+            if (step == 0.0) continue;
+            const vec scale = spread(step);
+            int64_t c = 0;
+            for (; c + WIDTH <= n; c += WIDTH) store(v + c, load(v + c) - scale * load(row + c));
+            for (; c < n; c++) v[c] -= step * row[c];
             lam[i] += step;
             moved = 1;
         }
@@ -250,18 +274,18 @@ INLINE void descend(const Boxes *p, Scratch *s, int sweeps) {
     }
 }
 
-/* Write the side on which v + lam pushes each row past its bounds; return how many differ from `side`. */
-INLINE int64_t push(const Boxes *p, const Scratch *s, signed char *side, const signed char *before) {
-    int64_t differ = 0;
-    for (int64_t i = 0; i < s->n; i++) {
-        const double lower = p->lower[i], upper = p->upper[i], pushed = s->v[i] + s->lam[i];
-        const int over = pushed > upper + p->hysteresis * (1.0 + fabs(upper));
-        const int under = pushed < lower - p->hysteresis * (1.0 + fabs(lower));
-        const signed char now = lower == upper ? 1 : (signed char)(over - under); /* no choice: always held */
-        differ += now != before[i];
-        side[i] = now;
+/* Write the side on which v + lam pushes each row past its bounds; return whether it is that of before. */
+INLINE int push(const Scratch *s, int64_t *side, const int64_t *before) {
+    mask differ = {0};
+    for (int64_t i = 0; i < s->n; i += WIDTH) {
+        const vec pushed = load(s->v + i) + load(s->lam + i);
+        const mask now = (pushed < load(s->below + i)) - (pushed > load(s->above + i));
+        mask old;
+        memcpy(&old, before + i, sizeof old);
+        differ |= now ^ old;
+        memcpy(side + i, &now, sizeof now);
     }
-    return differ;
+    return !any(differ);
 }
 
 /* List the rows that are held, those of before first and in their old order; return how many, and in `same` how many
@@ -287,17 +311,17 @@ INLINE int64_t relist(Scratch *s, int64_t k, int64_t *same) {
 INLINE int pivot(const Boxes *p, Scratch *s, int64_t *steps) {
     const int64_t n = s->n;
     int64_t k = 0, same = 0;
-    memset(s->side, 0, (size_t)n);
-    push(p, s, s->next, s->side);
+    memset(s->side, 0, (size_t)n * sizeof(int64_t));
+    push(s, s->next, s->side);
     for (int64_t step = 0; step < p->max_steps; step++) {
         k = relist(s, k, &same);
-        signed char *held = s->next;
+        int64_t *held = s->next;
         s->next = s->side, s->side = held;
         const int kept = make_room(s, k);
         if (kept < 0) return -1;
         for (int64_t j = 0; j < k; j++) {
             const int64_t i = s->rows[j];
-            s->rhs[i] = p->v0[i] - (held[i] > 0 ? p->upper[i] : p->lower[i]);
+            s->rhs[i] = p->v0[i] - (held[i] > 0 ? s->upper[i] : s->lower[i]);
         }
         if (!factor(s, p->G, k, kept ? same : 0, p->standing_out)) return -1;
         substitute(s, k);
@@ -305,7 +329,7 @@ INLINE int pivot(const Boxes *p, Scratch *s, int64_t *steps) {
         memset(s->lam, 0, (size_t)n * sizeof(double));
         for (int64_t j = 0; j < k; j++) s->lam[s->rows[j]] = s->x[j];
         ++*steps;
-        if (push(p, s, s->next, s->side) == 0) return 1;
+        if (push(s, s->next, s->side)) return 1;
     }
     return 0;
 }
@@ -315,6 +339,7 @@ INLINE int solve_one(const Boxes *p, Scratch *s, int64_t *steps) {
     double size = 0.0;
     for (int64_t i = 0; i < s->n; i++) size += p->v0[i];
     if (!isfinite(size)) return 0;
+    take_in(p, s);
     memcpy(s->v, p->v0, (size_t)s->n * sizeof(double));
     memset(s->lam, 0, (size_t)s->n * sizeof(double));
     int ended = 0;
