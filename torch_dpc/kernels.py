@@ -22,14 +22,17 @@ try:
 except ImportError:
     _kernels = None  # type: ignore[assignment]
 
-#: Steps after which a sample is left to the second engine; converging samples need 1 to 7.
-MAX_STEPS = 20
+#: Pivoting steps after which the kernel takes its second method; converging samples need 1 to 8.
+PIVOTS = 10
 #: By how much v + lam must pass a bound (relative to 1 + |bound|) for its row to be active. Without it rounding makes
 #: the set flicker at rows that only touch their bound.
 HYSTERESIS = 1e-12
 #: A Cholesky factor of G[A, A] is trusted where every row of Ct stands out of the span of those before it by this
 #: fraction of its length; G cannot tell less.
 STANDING_OUT = 1e-5
+#: A row that depends on the active ones may pass its bound by this (relative to 1 + |bound|): they hold it there, up to
+#: rounding.
+TOUCHING = 1e-10
 
 
 def serve(tensor: Tensor) -> bool:
@@ -49,9 +52,8 @@ def solve_boxes(
         threads: at most so many.
     """
     lam, steps, converged = np.empty_like(v0), np.empty(len(v0), dtype=np.int64), np.empty(len(v0), dtype=bool)
-    _kernels.solve_boxes(
-        G, v0, lower, upper, lam, steps, converged, HYSTERESIS, STANDING_OUT, MAX_STEPS, threads
-    )
+    settings = HYSTERESIS, STANDING_OUT, TOUCHING, PIVOTS
+    _kernels.solve_boxes(G, v0, lower, upper, lam, steps, converged, *settings, threads)
     return lam, steps, converged
 
 
