@@ -2,8 +2,7 @@
 
 from setuptools import Extension, setup
 
-setup(
-    ext_modules=[
-        Extension("torch_dpc._kernels", ["torch_dpc/_kernels.c"], extra_compile_args=["-O3"], optional=True),
-    ]
-)
+# -Wno-psabi: vectors are passed between inlined functions alone.
+FLAGS = ["-O3", "-Wno-psabi"]
+
+setup(ext_modules=[Extension("torch_dpc._kernels", ["torch_dpc/_kernels.c"], extra_compile_args=FLAGS, optional=True)])
