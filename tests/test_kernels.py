@@ -219,7 +219,15 @@ def test_nothing_to_do(n):
     ],
 )
 def test_arrays_that_do_not_fit_are_named(place, wrong, says):
-    arguments = [np.eye(3), np.zeros((2, 3)), -np.ones(3), np.ones(3), np.zeros((2, 3)), np.zeros(2, int), np.zeros(2, bool)]
+    arguments = [
+        np.eye(3),
+        np.zeros((2, 3)),
+        -np.ones(3),
+        np.ones(3),
+        np.zeros((2, 3)),
+        np.zeros(2, int),
+        np.zeros(2, bool),
+    ]
     settings = (1e-12, 1e-5, 1e-10, 10, 1)
     kernels._kernels.solve_boxes(*arguments, *settings)
     arguments[place] = wrong
@@ -234,7 +242,9 @@ def test_other_bad_arguments():
     frozen = np.zeros((2, 3))
     frozen.flags.writeable = False
     with pytest.raises(ValueError, match="read-only"):
-        kernels._kernels.solve_active(np.eye(3), np.ones((2, 3), bool), np.ones((2, 3)), frozen, np.ones(2, bool), 1e-5, 1)
+        kernels._kernels.solve_active(
+            np.eye(3), np.ones((2, 3), bool), np.ones((2, 3)), frozen, np.ones(2, bool), 1e-5, 1
+        )
 
 
 # --- the package with and without them -------------------------------------------------------------------------------
@@ -242,7 +252,7 @@ def test_other_bad_arguments():
 LAYERS = {
     "inputs": lambda: small_layer(),
     "inputs and outputs": lambda: small_layer(0.0, u_set=dpc.Box(-0.7, 0.7), y_set=dpc.Box(-0.9, 0.9)),
-    "outputs bite": lambda: small_layer( u_set=None, y_set=dpc.Box(-0.25, 0.25)),
+    "outputs bite": lambda: small_layer(u_set=None, y_set=dpc.Box(-0.25, 0.25)),
     "paper": lambda: paper_layer(),
 }
 

@@ -159,7 +159,7 @@ class SolveReduced(torch.autograd.Function):
         return outputs, (0,) * len(outputs)
 
 
-def _constants(solver: Solver) -> tuple[None, Tensor, Tensor, Tensor]:
+def _constants(solver: Solver) -> tuple[Any, Tensor, Tensor, Tensor]:
     """Return A, C and G where they are constants; theta, which their derivatives alone need, stays out."""
     return None, solver.reduction.A_theta, solver.reduction.rows.C, solver.reduction.G
 

@@ -52,8 +52,9 @@ def solve_boxes(
         threads: at most so many.
     """
     lam, steps, converged = np.empty_like(v0), np.empty(len(v0), dtype=np.int64), np.empty(len(v0), dtype=bool)
-    settings = HYSTERESIS, STANDING_OUT, TOUCHING, PIVOTS
-    _kernels.solve_boxes(G, v0, lower, upper, lam, steps, converged, *settings, threads)
+    _kernels.solve_boxes(
+        G, v0, lower, upper, lam, steps, converged, HYSTERESIS, STANDING_OUT, TOUCHING, PIVOTS, threads
+    )
     return lam, steps, converged
 
 
@@ -76,9 +77,7 @@ def adjoint(G: Tensor, active: Tensor, v_bar: Tensor, lam_bar: Tensor | None) ->
     out, trusted = np.empty(v_bar.shape), np.empty(len(v_bar), dtype=bool)
     lam_array = None if lam_bar is None else as_array(lam_bar)
     threads = torch.get_num_threads()
-    _kernels.adjoint(
-        as_array(G), as_array(active), as_array(v_bar), lam_array, out, trusted, STANDING_OUT, threads
-    )
+    _kernels.adjoint(as_array(G), as_array(active), as_array(v_bar), lam_array, out, trusted, STANDING_OUT, threads)
     return torch.from_numpy(out), torch.from_numpy(trusted)
 
 

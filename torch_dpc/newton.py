@@ -57,8 +57,9 @@ def solve_newton(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor
 def _by_kernel(G: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> ActiveSetResult:
     if lower.ndim != upper.ndim:
         lower, upper = lower.expand_as(v0), upper.expand_as(v0)
-    arrays = (kernels.as_array(x) for x in (G, v0, lower, upper))
-    return ActiveSetResult(*map(torch.from_numpy, kernels.solve_boxes(*arrays, torch.get_num_threads())))
+    G_array, centre, low, high = (kernels.as_array(x) for x in (G, v0, lower, upper))
+    found = kernels.solve_boxes(G_array, centre, low, high, torch.get_num_threads())
+    return ActiveSetResult(*map(torch.from_numpy, found))
 
 
 def _together(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> ActiveSetResult:

@@ -28,7 +28,7 @@ def apply_function(function: type[torch.autograd.Function], *args: Any) -> Any:
     """
     if _are_transforms_active() or not all(is_plain(arg) for arg in args if isinstance(arg, Tensor)):
         return function.apply(*args)
-    return super(torch.autograd.Function, function).apply(*args)
+    return super(torch.autograd.Function, function).apply(*args)  # type: ignore[misc]
 
 
 def is_grads_batched(tensor: Tensor) -> bool:
