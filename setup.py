@@ -2,7 +2,12 @@
 
 from setuptools import Extension, setup
 
-# -Wno-psabi: vectors are passed between inlined functions alone.
-FLAGS = ["-O3", "-Wno-psabi"]
+kernels = Extension(
+    "torch_dpc._kernels",
+    ["torch_dpc/_kernels.c"],
+    depends=["torch_dpc/_system.h", "torch_dpc/_boxes.h", "torch_dpc/_batch.h"],
+    extra_compile_args=["-O3", "-Wno-psabi"],  # vectors are passed between inlined functions alone
+    optional=True,
+)
 
-setup(ext_modules=[Extension("torch_dpc._kernels", ["torch_dpc/_kernels.c"], extra_compile_args=FLAGS, optional=True)])
+setup(ext_modules=[kernels])
