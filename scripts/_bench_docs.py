@@ -9,6 +9,7 @@ from pathlib import Path
 from _bench_cases import FASTEST, LOOP
 from _bench_report import Line, cvxpylayers, each, made_with, number, of, ratio, ratios, remark, scaling, table
 
+END = "<!-- end -->"
 NAMES = {LOOP: "DAQP in a Python loop, forward only, set up once"}
 
 
@@ -23,9 +24,8 @@ def refresh(page: Path, results: Path, lines: list[Line]) -> None:
     if sorted(marked) != sorted(blocks):
         raise ValueError(f"{page} must mark {', '.join(sorted(blocks))}, got {', '.join(sorted(marked))}.")
     for name, block in blocks.items():
-        mark = f"<!-- measured: {name} -->"
-        inside = re.compile(re.escape(mark) + ".*?<!-- end -->", re.DOTALL)
-        text = inside.sub(lambda _, whole=f"{mark}\n{block.strip()}\n<!-- end -->": whole, text)
+        head, old = text.split(f"<!-- measured: {name} -->", 1)
+        text = f"{head}<!-- measured: {name} -->\n{block.strip()}\n{END}{old.split(END, 1)[1]}"
     page.write_text(text)
     shutil.copy(results / "benchmark.png", page.parent / "images" / "benchmark.png")
 
