@@ -276,6 +276,21 @@ def test_plans_and_gradients_without_the_kernels_are_the_same(name, count, monke
         assert relative(a.double(), b.double()) < 1e-8
 
 
+@pytest.mark.parametrize("solver", ["auto", "newton", "daqp"])
+@pytest.mark.parametrize("batch", [(), (3,)], ids=str)
+def test_gradcheck_without_the_kernels(batch, solver, monkeypatch):
+    without_kernels(monkeypatch)
+    layer = small_layer(u_set=dpc.Box(-0.4, 0.4), y_set=dpc.Box(-0.9, 0.9), solver=solver)
+    u_ini, y_ini = windows(3, 3, seed=1, scale=0.5)
+    u_ini, y_ini = (w if batch else w[0] for w in (u_ini, y_ini + 0.1 * randn(3, 3, 4, seed=2)))
+
+    def plan(y_ini):
+        sol = layer(u_ini, y_ini, y_ref=Y_REF + 0.1 * randn(6, 4, seed=3), u_ref=0.3 * randn(6, 2, seed=4))
+        return sol.u, sol.y, sol.lam
+
+    assert torch.autograd.gradcheck(plan, y_ini.requires_grad_(), check_forward_ad=True)
+
+
 def test_the_environment_switches_them_off():
     program = "from torch_dpc import kernels; import torch; assert not kernels.serve(torch.ones(1))"
     environment = {**os.environ, "TORCH_DPC_NO_KERNELS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}

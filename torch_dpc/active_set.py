@@ -68,7 +68,7 @@ def _packed(G: Tensor, active: Tensor, rhs: Tensor) -> tuple[Tensor, Tensor]:
     block = _blocks(_identity_padded(G), index)
     L, info = torch.linalg.cholesky_ex(block)
     x = torch.cholesky_solve(rhs.gather(1, index.clamp_max(n - 1))[..., None], L)[..., 0]
-    lam = x.new_zeros(len(rhs), 2 * n).scatter_(1, index, x)[:, :n]
+    lam = torch.zeros_like(rhs).masked_scatter(active, x[index < n])
     if L.shape[-1] == 0:
         return lam, info == 0
     # What of a row stands out of the span of those before it, as a fraction of its length: free of units.
