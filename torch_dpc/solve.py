@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -178,12 +177,15 @@ class Solver:
         return Solved(judged.v, found.lam, judged.active, torch.stack([i.double() for i in info], dim=-1))
 
     def _one_by_one(self, theta: Tensor, lower: Tensor, upper: Tensor, daqp_first: bool) -> Planned | None:
-        """Solve and judge the samples in NumPy; None where that does not do, or one of them does not convince."""
+        """Solve and judge the samples in NumPy; None where that does not do, or one of them does not convince.
+
+        A value that is not finite does not: the engines flag what comes of it, and the batched way says its name.
+        """
         if theta.device.type != "cpu" or not (daqp_first or kernels.serve(theta)):
             return None
         plain = lower.ndim == upper.ndim == 1 and self.reduction.G.ndim == 2 and self.reduction.rows.Eq_range is None
         batch, sample = theta.shape[:-1], theta.numpy()
-        if not plain or not math.isfinite(sample.sum()):
+        if not plain:
             return None
         bounds = lower.numpy(), upper.numpy()
         if not batch:
