@@ -221,7 +221,7 @@ SKEW = torch.eye(4) + torch.triu(torch.ones(4, 4), 1)
         ({"solver": "osqp"}, "`solver` must be one of .* got 'osqp'"),
         ({"backward": "none"}, "`backward` must be one of 'reduced', 'full', got 'none'"),
         ({"on_failure": None}, "`on_failure` must be one of"),
-        ({"data": 3}, "`data` must be a HankelData, got int"),
+        ({"data": 3}, "`data` must be a HankelData or a HankelBatch, got int"),
     ],
     ids=lambda v: v[:40] if isinstance(v, str) else "",
 )

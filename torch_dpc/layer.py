@@ -335,12 +335,13 @@ class DPCLayer(nn.Module):
         Raises:
             ValueError: a set is no box.
         """
-        if not self.feasible_set.is_box:
+        sets = self.feasible_set
+        if not sets.is_box:
             raise ValueError("the sets of this layer are not all boxes: they have no bounds.")
-        sources = tuple(bound for owner, _ in self.feasible_set.parts for bound in (owner.lower, owner.upper))
+        sources = tuple(bound for owner, _ in sets.parts for bound in (owner.lower, owner.upper))
         if carries_derivative(sources):
-            return self.feasible_set.bounds(device)
-        return self._cached(("bounds", device), sources, self.feasible_set.bounds, device)
+            return sets.bounds(device)
+        return self._cached(("bounds", device), sources, sets.bounds, device)
 
     def _cached(self, key: tuple[str, torch.device], sources: tuple[Any, ...], make: Any, *args: Any) -> Any:
         """Return what `make` makes of the sources, made anew when their values have changed."""
@@ -435,6 +436,8 @@ def _with_failures(solver: Any, on_failure: str | None) -> Any:
 
 def _is_same(kept: Any, now: Any) -> bool:
     """Compare values: version counters would be cheaper, but miss edits through `.data`."""
+    if kept is now:  # no tensor: those are kept as copies
+        return True
     if isinstance(kept, Tensor) and isinstance(now, Tensor):
         if kept.device != now.device:
             kept = kept.to(now.device)

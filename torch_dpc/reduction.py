@@ -63,9 +63,13 @@ class Reduction:
     is_selection: bool
 
     def detach(self) -> Reduction:
-        """Return the same numbers without their graph."""
+        """Return the same numbers without their graph.
+
+        With a graph G is C A_lam; here it is Ct Ct' in any case, which loses less, so that a graph changes no result.
+        """
         rows, weights = (part.map(lambda tensor, _: tensor.detach()) for part in (self.rows, self.weights))
-        return replace(_map_tensors(self, Tensor.detach), rows=rows, weights=weights)
+        plain = _map_tensors(self, Tensor.detach)
+        return replace(plain, G=plain.Ct @ plain.Ct.mT, rows=rows, weights=weights)
 
     def of_batch(self, batch: torch.Size) -> Reduction:
         """Return one problem a sample of a flattened batch; itself where all samples share one problem."""
