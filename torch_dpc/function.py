@@ -177,7 +177,7 @@ def _of_one(
     lam_array = None if lam_bar is None else kernels.as_array(lam_bar)
     A, C, G = solver.arrays
     v0_bar = kernels.adjoint_of_one(G, active.numpy(), v_bar, lam_array)
-    return None if v0_bar is None else torch.from_numpy((v0_bar @ C) @ A)
+    return None if v0_bar is None else torch.from_numpy(v0_bar.dot(C).dot(A))
 
 
 class SolveAdjoint(torch.autograd.Function):

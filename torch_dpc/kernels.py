@@ -40,6 +40,11 @@ def serve(tensor: Tensor) -> bool:
     return _kernels is not None and tensor.device.type == "cpu"
 
 
+def instructions() -> str:
+    """Return which vector instructions the kernels use here, "none" where there are no kernels."""
+    return "none" if _kernels is None else _kernels.instructions
+
+
 def solve_boxes(
     G: np.ndarray, v0: np.ndarray, lower: np.ndarray, upper: np.ndarray, threads: int = 1
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -12,6 +12,7 @@ third of torch's.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -65,9 +66,9 @@ BATCHED = Arithmetic(
 )
 SINGLE = Arithmetic(
     array=lambda tensor: tensor.numpy(),
-    norm=lambda x: (x @ x) ** 0.5,
+    norm=lambda x: math.sqrt(x.dot(x)),  # half the time of (x @ x) ** 0.5
     clip=lambda x, lower, upper: np.minimum(np.maximum(x, lower), upper),
-    combine=lambda lam, rows: lam[held := lam.nonzero()[0]] @ rows[held],
+    combine=lambda lam, rows: lam[held := lam.nonzero()[0]].dot(rows[held]),
     count=np.count_nonzero,
     join=np.concatenate,
 )
@@ -202,5 +203,5 @@ def _back(x: Any, matrix: Any) -> Any:
 
 def _times(matrix: Any, x: Any) -> Any:
     if x.ndim == 1:
-        return matrix @ x
+        return matrix.dot(x)
     return x @ matrix.mT if matrix.ndim == 2 else (matrix @ x[..., None])[..., 0]
