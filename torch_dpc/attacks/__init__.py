@@ -4,9 +4,11 @@ from .budgets import Ball, Box, Budget, Ellipsoid, RelativeBall
 from .costs import Cost, TargetInput
 from .gradient import LinearizedAttack
 from .iterative import FrankWolfeAttack, ProjectedGradientAttack
+from .policy import AttackPolicy, PolicyAttack
 from .random import RandomAttack
 
 __all__ = [
+    "AttackPolicy",
     "Ball",
     "Box",
     "Budget",
@@ -14,6 +16,7 @@ __all__ = [
     "Ellipsoid",
     "FrankWolfeAttack",
     "LinearizedAttack",
+    "PolicyAttack",
     "ProjectedGradientAttack",
     "RandomAttack",
     "RelativeBall",
