@@ -4,7 +4,8 @@ from .budgets import Ball, Box, Budget, Ellipsoid, RelativeBall
 from .costs import Cost, TargetInput
 from .gradient import LinearizedAttack
 from .iterative import FrankWolfeAttack, ProjectedGradientAttack
-from .policy import AttackPolicy, PolicyAttack
+from .network import AttackPolicy
+from .policy import PolicyAttack
 from .random import RandomAttack
 
 __all__ = [

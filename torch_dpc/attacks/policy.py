@@ -2,23 +2,16 @@
 
 from __future__ import annotations
 
-import itertools
-import math
-import re
-from collections.abc import Mapping, Sequence
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
-from ..checks import as_data, check_count, is_finite, reference, window
-from ..hankel import HankelData
+from ..checks import as_data, is_finite
 from .budgets import Ball, Budget, Ellipsoid
 
 #: How far outside its budget a perturbation may be, relative to its size, before it is a defect.
 BUDGET_TOLERANCE = 1e-9
-#: Principal axes of the inputs that vary less than this, relative to the strongest, are left out.
-NEGLIGIBLE = 1e-3
 
 
 class PolicyAttack(nn.Module):
@@ -39,7 +32,7 @@ class PolicyAttack(nn.Module):
     makes it as free of graphs as the other attacks.
 
     Args:
-        policy: (u_ini, y_ini, y_ref, u_ref, step) -> d: an :class:`AttackPolicy`, or any module.
+        policy: (u_ini, y_ini, y_ref, u_ref, step) -> d: a :class:`torch_dpc.attacks.AttackPolicy`, or any module.
         budget: the admissible perturbations.
         reach: "support" or "projection"; by default what suits the budget.
 
@@ -47,7 +40,7 @@ class PolicyAttack(nn.Module):
         >>> import torch_dpc as dpc
         >>> plant, generator = dpc.systems.OscillatingMasses(), torch.Generator().manual_seed(0)
         >>> data = dpc.HankelData.from_trajectories(*dpc.collect(plant, 120, generator=generator), t_ini=4, horizon=10)
-        >>> policy = AttackPolicy(data, generator=generator)
+        >>> policy = dpc.attacks.AttackPolicy(data, generator=generator)
         >>> attack = PolicyAttack(policy, dpc.attacks.RelativeBall(0.1))
         >>> p = attack(torch.zeros(4, 2), torch.ones(4, 4))
         >>> p.shape, round(float(p.detach().norm() / torch.ones(4, 4).norm()), 6)
@@ -103,7 +96,9 @@ class PolicyAttack(nn.Module):
         if self.reach == "support":
             return support
         length, size = (torch.linalg.vector_norm(x, dim=(-2, -1), keepdim=True) for x in (support, direction))
-        return self.budget.project(direction * torch.where(size > 0, length / size.clamp_min(1e-300), 0.0), y_ini)
+        # Nothing of length 0 is projected: a budget may divide by it.
+        somewhere = torch.where(size > 0, direction, 1.0) * (_or_one(length) / _or_one(size))
+        return torch.where(size > 0, self.budget.project(somewhere, y_ini), 0.0)
 
     def _check(self, p: Tensor, y_ini: Tensor) -> None:
         tolerance = BUDGET_TOLERANCE if p.dtype == torch.float64 else 10 * torch.finfo(p.dtype).eps
@@ -112,154 +107,5 @@ class PolicyAttack(nn.Module):
             raise AssertionError(f"the attack left its budget by {float(worst.max()):.1e} of its size.")
 
 
-class AttackPolicy(nn.Module):
-    """A small network from what an attacker measures to a direction of attack.
-
-        z = (x - mean) whiten,   x = (u_ini, y_ini, u_ref, y_ref, context of the step)
-        d = W z + b + W_k relu(... relu(W_1 z + b_1) ...)
-
-    Algorithm 1's direction is, before it is normalised, piecewise affine in x: the gradient of a quadratic through a
-    plan that is piecewise affine. So is this map, and the way around the hidden layers is all of it where no bound
-    becomes active. Build it with `for_windows`, which whitens by the principal axes of recorded inputs: a velocity is a
-    small difference of large positions, and unwhitened the network does not find it.
-
-    Args:
-        data: what the sizes of the windows are taken from.
-        hidden: the width of each hidden layer.
-        context: what else moves with the step and decides the attack, `(>= steps, n)`, such as the trajectory of a
-            `TargetInput`; the network sees the rows of the horizon from the step on, the last held beyond the end.
-        whitening: mean `(n_x,)` and whiten `(n_x, features)`; by default z = x.
-        generator: of the first weights.
-
-    Example:
-        >>> import torch_dpc as dpc
-        >>> u = torch.rand(60, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-        >>> data = dpc.HankelData.from_trajectories(u, u.cumsum(0) - u, t_ini=2, horizon=5)
-        >>> policy = AttackPolicy(data, hidden=(8,), generator=torch.Generator().manual_seed(1))
-        >>> policy(torch.zeros(3, 2, 1), torch.ones(3, 2, 1)).shape
-        torch.Size([3, 2, 1])
-    """
-
-    mean: Tensor
-    whiten: Tensor
-    context: Tensor | None
-
-    def __init__(
-        self,
-        data: HankelData,
-        *,
-        hidden: Sequence[int] = (32, 32),
-        context: Any = None,
-        whitening: tuple[Tensor, Tensor] | None = None,
-        generator: torch.Generator | None = None,
-    ):
-        super().__init__()
-        for width in hidden:
-            check_count("hidden", width)
-        if context is not None and (context := as_data("context", context).double()).ndim != 2:
-            raise ValueError(f"`context` must have shape (>= steps, n), got {tuple(context.shape)}.")
-        self.data_sizes = data.t_ini, data.horizon, data.n_u, data.n_y
-        past, future = (data.n_u, data.n_y), (data.n_u, data.n_y, 0 if context is None else context.shape[1])
-        #: Entries of the parts of x.
-        self.sizes = [*(data.t_ini * n for n in past), *(data.horizon * n for n in future)]
-        n_x, out = sum(self.sizes), data.t_ini * data.n_y
-        if whitening is None:
-            whitening = torch.zeros(n_x, dtype=torch.float64), torch.eye(n_x, dtype=torch.float64)
-        for name, value in (("context", context), *zip(("mean", "whiten"), whitening, strict=True)):
-            self.register_buffer(name, value)
-        self.skip = _linear(self.whiten.shape[1], out, generator)
-        widths = [self.whiten.shape[1], *hidden, out] if hidden else []
-        self.hidden = nn.ModuleList(_linear(n, m, generator) for n, m in itertools.pairwise(widths))
-
-    @classmethod
-    def for_windows(cls, data: HankelData, recorded: Sequence[Any], **options: Any) -> AttackPolicy:
-        """Return a policy that is whitened for recorded inputs.
-
-        Args:
-            data: as for the constructor.
-            recorded: arguments of a call: u_ini, y_ini, y_ref, u_ref, step, with one batch dimension where they vary.
-            options: `hidden`, `context` and `generator` of the constructor.
-        """
-        parts = cls(data, hidden=(), context=options.get("context"))._parts(*recorded)
-        batch = max(len(part) for part in parts if part.ndim == 2)
-        return cls(data, whitening=principal_axes(torch.cat([p.expand(batch, -1) for p in parts], dim=1)), **options)
-
-    @classmethod
-    def from_state_dict(cls, data: HankelData, state: Mapping[str, Tensor]) -> AttackPolicy:
-        """Return the policy of a `state_dict`, whatever its widths; data as for the constructor."""
-        widths = [len(tensor) for name, tensor in state.items() if re.fullmatch(r"hidden\.\d+\.bias", name)]
-        whitening = state["mean"], state["whiten"]
-        policy = cls(data, hidden=widths[:-1], context=state.get("context"), whitening=whitening)
-        policy.load_state_dict(state)
-        return policy
-
-    def forward(self, u_ini: Any, y_ini: Any, y_ref: Any = None, u_ref: Any = None, step: Any = 0) -> Tensor:
-        """Return a direction, `(*batch, t_ini, n_y)`, float64; only its direction counts.
-
-        Args:
-            u_ini, y_ini: past windows, `(*batch, t_ini, n)`.
-            y_ref, u_ref: references, broadcast to `(*batch, horizon, n)`; zero by default.
-            step: of the run, an integer, or one for each sample, `(*batch,)`.
-        """
-        layers = [self.skip, *self.hidden[:1]]
-        first = self.whiten @ torch.cat([layer.weight for layer in layers]).mT  # the first layers, as a map of x
-        total = torch.cat([layer.bias for layer in layers]) - self.mean @ first
-        for part, rows in zip(self._parts(u_ini, y_ini, y_ref, u_ref, step), first.split(self.sizes), strict=True):
-            total = total + part @ rows
-        direction, z = total.split((self.skip.out_features, total.shape[-1] - self.skip.out_features), dim=-1)
-        for layer in self.hidden[1:]:
-            z = layer(z.relu())
-        if len(self.hidden):
-            direction = direction + z
-        return direction.unflatten(-1, (self.data_sizes[0], self.data_sizes[3]))
-
-    def _parts(self, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any, step: Any) -> list[Tensor]:
-        """Return the parts of x flattened, `(*batch, size)` each; the batches broadcast."""
-        t_ini, horizon, n_u, n_y = self.data_sizes
-        u_ini, y_ini = window("u_ini", u_ini, t_ini, n_u, "n_u"), window("y_ini", y_ini, t_ini, n_y, "n_y")
-        parts = [
-            u_ini,
-            y_ini,
-            reference("u_ref", u_ref, horizon, n_u, "n_u", u_ini),
-            reference("y_ref", y_ref, horizon, n_y, "n_y", y_ini),
-        ]
-        if self.context is None:
-            parts.append(y_ini.new_zeros(horizon, 0))
-        else:
-            steps = torch.as_tensor(step, device=self.context.device)[..., None] + torch.arange(horizon).to(
-                self.context.device
-            )
-            parts.append(self.context[steps.clamp(max=len(self.context) - 1)])
-        return [part.flatten(-2).to(self.whiten) for part in parts]
-
-
-def principal_axes(x: Tensor, negligible: float = NEGLIGIBLE) -> tuple[Tensor, Tensor]:
-    """Return the mean and the map that gives every principal axis of x the variance 1.
-
-    Entries are brought to one scale first, so units do not matter; constant entries and axes along which x hardly
-    varies are left out.
-
-    Args:
-        x: `(samples, n)`.
-        negligible: relative to the strongest axis.
-
-    Returns:
-        mean `(n,)` and whiten `(n, axes)`: z = (x - mean) whiten.
-    """
-    mean, scale = x.mean(0), x.std(0, correction=0)
-    varies = scale > 1e-9 * (mean.abs() + scale)
-    unit = torch.where(varies, 1 / torch.where(varies, scale, 1.0), 0.0)
-    _, size, axes = torch.linalg.svd((x - mean) * unit, full_matrices=False)
-    kept = size > negligible * size[0]
-    return mean, unit[:, None] * axes[kept].mT * (len(x) ** 0.5 / size[kept])
-
-
-def _linear(n: int, m: int, generator: torch.Generator | None) -> nn.Linear:
-    """Return a linear layer whose weights come from the generator, of variance 1 / n; the biases are 0."""
-    layer = nn.utils.skip_init(nn.Linear, n, m, dtype=torch.float64)
-    with torch.no_grad():
-        layer.weight.copy_(
-            math.sqrt(3 / max(n, 1)) * (2 * torch.rand(m, n, dtype=torch.float64, generator=generator) - 1)
-        )
-        layer.bias.zero_()
-    return layer
+def _or_one(size: Tensor) -> Tensor:
+    return torch.where(size > 0, size, 1.0)
