@@ -10,12 +10,15 @@ from typing import Any
 import numpy as np
 import torch
 
+from _adversary_loop import Windows
 from _adversary_losses import psi_at
-from _adversary_plants import PLANTS, Windows
+from _adversary_masses import Masses
+from _adversary_quadrotor import Quadrotor
 from _adversary_training import policy_tensors, read_tensors
 from _common import NOMINAL, POISON, RANDOM
 from torch_dpc import attacks
 
+PLANTS = {"masses": Masses, "quadrotor": Quadrotor}
 PROJECTED, WINDOWS, CLOSED_LOOP = "projected_gradient", "windows", "closed-loop"
 TIMED_BATCH, REPEATS = 1024, 15
 NOISE_SEED = 1000

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from _adversary_plants import Masses, Windows, drawn
+from _adversary_loop import Windows, drawn
 from torch_dpc import attacks
 
 TINY = 1e-12
@@ -63,17 +63,17 @@ class WindowLosses:
 
 
 class LoopLoss:
-    """The error of the masses in closed loop, from random initial states, at every rho.
+    """The error in closed loop, from random starts, at every rho.
 
     Args:
-        plant: the masses.
+        plant: an experiment, whose `loop` has derivatives.
         layer: of the controller.
         policy: the network.
         batch: closed loops an iteration, over all processes; as many at each rho.
-        seed: of the initial states.
+        seed: of the starts.
     """
 
-    def __init__(self, plant: Masses, layer: Any, policy: nn.Module, batch: int, seed: int):
+    def __init__(self, plant: Any, layer: Any, policy: nn.Module, batch: int, seed: int):
         self.plant, self.layer, self.policy, self.seed = plant, layer, policy, seed
         self.starts = -(-batch // len(plant.rhos))
 
@@ -81,10 +81,10 @@ class LoopLoss:
         """Return - error / rho, averaged; back through every plan of the run."""
         starts = self.plant.starts(self.starts, seeded(self.seed, iteration).initial_seed())
         rho = torch.tensor(self.plant.rhos, dtype=torch.float64).repeat_interleave(len(starts))
-        starts = starts.repeat(len(self.plant.rhos), 1)
+        starts = torch.cat([starts] * len(self.plant.rhos))
         attack = attacks.PolicyAttack(self.policy, attacks.RelativeBall(rho[share]))
         outputs, _ = self.plant.loop(self.layer, attack, starts[share])
-        return -(self.plant.error(outputs) / rho[share]).sum() / len(starts)
+        return -(self.plant.error(outputs, starts[share]) / rho[share]).sum() / len(starts)
 
 
 def psi_at(plant: Any, step: Tensor) -> Callable[[Any], Tensor]:

@@ -29,8 +29,9 @@ LOOKS = {
 HEAD = """# Trained adversaries: {plant}
 
 Decreases of psi are relative to Algorithm 1's on the same windows, recorded in closed loop with seeds of their own: the
-ratio of the means at each rho, and the median over the windows of the ratio on each. Times are medians over calls
-for {batch} windows, and for one window alone, on one thread. Errors in closed loop are means over runs and seeds [m]; {failed}."""
+ratio of the means at each rho, and the median over the windows of the ratio on each. Times are medians over calls for
+{batch} windows, and for one window alone, on one thread. Errors in closed loop are means over runs and seeds [m], with
+Algorithm 1's beside them; {failed}."""
 
 
 def chosen(rows: Rows, column: str, setting: str, attack: str, rho: float) -> Array:
@@ -111,6 +112,9 @@ def picture(path: Path, rows: Rows, curves: Rows, rhos: Sequence[float]) -> None
         mine = curves["mode"] == mode
         left.plot(curves["total"][mine], curves["of_algorithm1"][mine], **{**LOOKS[mode], "marker": "None"})
     left.axhline(1.0, color=COLOURS[POISON], linestyle=(0, (4, 2)))
+    imitated = curves["total"][curves["stage"] == "imitate"].max()
+    left.axvline(imitated, color="grey", linestyle=":")
+    left.annotate("own aim ", (imitated, 0.5), xycoords=("data", "axes fraction"), rotation=90, ha="right", va="center")
     left.set(title="training, on held-out data", xlabel="iteration", ylabel="effect relative to Algorithm 1")
     for name in names_in(rows):
         points = [
@@ -120,7 +124,7 @@ def picture(path: Path, rows: Rows, curves: Rows, rhos: Sequence[float]) -> None
         middle.plot(*points, linestyle="None", label=TITLES[name], **LOOKS[name])
     middle.axhline(1.0, color=COLOURS[POISON], linestyle=(0, (4, 2)))
     middle.set(
-        title="held-out windows", xscale="log", xlabel="time a sample [us]", ylabel="decrease of psi / Algorithm 1's"
+        title="held-out windows", xscale="log", xlabel="time a sample [µs]", ylabel="decrease of psi / Algorithm 1's"
     )
     setting = next(s for s in dict.fromkeys(rows["setting"]) if s != HELD_OUT_WINDOWS)
     for name in names_in(rows):

@@ -41,6 +41,7 @@ class Stage:
         iterations: how many.
         rate: of the first step of Adam; it falls to zero along a half cosine.
         largest: norm beyond which a gradient is cut.
+        every: iterations between two records.
     """
 
     name: str
@@ -48,6 +49,7 @@ class Stage:
     iterations: int
     rate: float
     largest: float = math.inf
+    every: int = 50
 
 
 @dataclass
@@ -72,7 +74,6 @@ def train(
     *,
     settings: dict[str, Any],
     validate: Callable[[], float] = lambda: math.nan,
-    every: int = 50,
     label: str = "training",
 ) -> Tensor:
     """Train in place, from the checkpoint if there is one, and return the curve, `Progress.curve`.
@@ -80,10 +81,9 @@ def train(
     Args:
         policy: its trainable parameters learn.
         stages: one after the other, each with a new optimiser.
-        checkpoint: written every so many iterations and at the end of each stage.
+        checkpoint: written at every record.
         settings: a checkpoint made with others is refused.
         validate: measured at every record.
-        every: iterations between two records.
         label: of the progress bar.
 
     Raises:
@@ -107,7 +107,7 @@ def train(
             loss = step(policy, optimizer, stage, progress.iteration)
             progress.iteration += 1
             bar.update()
-            if progress.iteration % every == 0 or progress.iteration == stage.iterations:
+            if progress.iteration % stage.every == 0 or progress.iteration == stage.iterations:
                 record = [progress.stage, progress.iteration, loss, validate()]
                 bar.set_postfix_str(f"{stage.name}: {record[3]:.3f}")
                 progress.curve = torch.cat([progress.curve, torch.tensor([record], dtype=torch.float64)])

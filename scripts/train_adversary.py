@@ -4,10 +4,11 @@
     python scripts/train_adversary.py --plant quadrotor     # about 3 minutes
     torchrun --nproc-per-node 2 scripts/train_adversary.py --plant masses       # the same, each batch on two processes
 
-`--mode windows` trains through the layer on windows recorded in closed loop: first Algorithm 1's direction is imitated,
-then psi is lowered. `--mode closed-loop`, for the masses, makes the error of the whole run large, back through twenty
-plans and the plant itself. Default is all that the plant offers. A run that is killed goes on where it was when it is
-started again; `--restart` begins anew. Leaves, in results/:
+`--mode windows` trains through the layer on windows recorded in closed loop: Algorithm 1's direction is imitated, then
+psi lowered. `--mode closed-loop` goes on from the imitation and makes the error of the whole run large, back through
+every plan and the plant: the masses' own dynamics, or a linear model of the quadrotor fitted to the controller's
+recording. Default is both. A run that was killed goes on where it was when started again; `--restart` begins anew.
+Leaves, in results/:
 
     adversary_{plant}.csv       every comparison: decrease of psi and time on held-out windows, error in closed loop
     adversary_{plant}.md, .png  the same as tables and a picture
@@ -28,8 +29,8 @@ import torch
 import torch.distributed as dist
 
 import _adversary_judge as judge
+from _adversary_loop import HELD_OUT, TRAINING, Windows
 from _adversary_losses import LoopLoss, WindowLosses, psi_at
-from _adversary_plants import HELD_OUT, PLANTS, TRAINING, Windows
 from _adversary_report import picture, windows_table, write_report
 from _adversary_training import Stage, process_group, rank, read_tensors, train, world, write_tensors
 from _common import arguments, read_rows, run_all, versions, write_rows
@@ -37,12 +38,33 @@ from torch_dpc import attacks
 
 HIDDEN = (32, 32)
 # Iterations of each stage, windows and closed loops an iteration, runs recorded for training and for judging.
-FULL = {"imitate": 1500, "lower": 200, "loop": 200, "batch": 256, "loops": 48, "runs": 48, "held_out": 48}
-QUICK = {"imitate": 20, "lower": 4, "loop": 3, "batch": 16, "loops": 6, "runs": 6, "held_out": 6}
-RATE = {"imitate": 3e-3, "lower": 1e-3, "loop": 3e-3}
-LARGEST_GRADIENT = 1.0  # in closed loop, where gradients of a few runs are large
-EVERY = 50  # iterations between two records
-MODES = {"masses": (judge.WINDOWS, judge.CLOSED_LOOP), "quadrotor": (judge.WINDOWS,)}
+FULL = {
+    "masses": {
+        "imitate": 1500,
+        "lower": 200,
+        "warm": 400,
+        "loop": 150,
+        "batch": 256,
+        "loops": 48,
+        "runs": 48,
+        "kept": 48,
+    },
+    "quadrotor": {
+        "imitate": 1500,
+        "lower": 150,
+        "warm": 400,
+        "loop": 40,
+        "batch": 256,
+        "loops": 24,
+        "runs": 48,
+        "kept": 48,
+    },
+}
+QUICK = {"imitate": 20, "lower": 4, "warm": 20, "loop": 3, "batch": 16, "loops": 6, "runs": 6, "kept": 6}
+RATE = {"imitate": 3e-3, "lower": 1e-3, "loop": 3e-3}  # of Adam
+LARGEST_GRADIENT = 1.0  # in closed loop, where a few runs may have large ones
+VALIDATED_LOOPS = 8
+MODES = (judge.WINDOWS, judge.CLOSED_LOOP)
 
 
 class Training:
@@ -51,16 +73,16 @@ class Training:
     Args:
         plant: the name of an experiment.
         out: the folder of the results.
-        size: `FULL` or `QUICK`.
+        size: an entry of `FULL`, or `QUICK`.
         seed: of the first weights, the recorded runs and the batches.
         workers: processes that record.
     """
 
     def __init__(self, plant: str, out: Path, size: dict[str, Any], seed: int, workers: int):
-        self.plant, self.out, self.size, self.seed, self.workers = PLANTS[plant](), out, size, seed, workers
+        self.plant, self.out, self.size, self.seed, self.workers = judge.PLANTS[plant](), out, size, seed, workers
         self.layer = self.plant.layer(TRAINING)
-        self.windows = self._recorded("recording", TRAINING + seed, size["runs"], every_step=True)
-        self.held_out = self._recorded("held_out", HELD_OUT + seed, size["held_out"], every_step=False)
+        self.windows = self._recorded("recording", 1000 * (1 + seed), size["runs"], every_step=True)
+        self.held_out = self._recorded("held_out", HELD_OUT, size["kept"], every_step=False)
 
     def checkpoint(self, mode: str) -> Path:
         """Return where a network is kept."""
@@ -76,28 +98,32 @@ class Training:
 
     def train(self, mode: str) -> list[dict[str, Any]]:
         """Train the network of a mode and return its curve."""
-        w = self.windows
-        generator = torch.Generator().manual_seed(self.seed)
+        w, size = self.windows, self.size
         policy = attacks.AttackPolicy.for_windows(
             self.layer.data,
             (w.u_ini, w.y_ini, w.y_ref, w.u_ref, w.step),
             hidden=HIDDEN,
             context=self.plant.context,
-            generator=generator,
+            generator=torch.Generator().manual_seed(self.seed),
         )
-        losses = WindowLosses(self.plant, self.layer, w, policy, self.size["batch"], self.seed)
-        stages = [Stage("imitate", losses.imitate, self.size["imitate"], RATE["imitate"])]
+        losses = WindowLosses(self.plant, self.layer, w, policy, size["batch"], self.seed)
         if mode == judge.WINDOWS:
-            stages.append(Stage("lower psi", losses.lower, self.size["lower"], RATE["lower"]))
+            stages = [
+                Stage("imitate", losses.imitate, size["imitate"], RATE["imitate"], every=100),
+                Stage("lower psi", losses.lower, size["lower"], RATE["lower"], every=10),
+            ]
             validate = self._validate_windows(policy)
         else:
-            loop = LoopLoss(self.plant, self.layer, policy, self.size["loops"], self.seed)
-            stages.append(Stage("closed loop", loop, self.size["loop"], RATE["loop"], LARGEST_GRADIENT))
+            loss = LoopLoss(self.plant, self.layer, policy, size["loops"], self.seed)
+            stages = [
+                Stage("imitate", losses.imitate, size["warm"], RATE["imitate"], every=100),
+                Stage("closed loop", loss, size["loop"], RATE["loop"], LARGEST_GRADIENT, every=5),
+            ]
             validate = self._validate_loop(policy)
         settings = {"plant": self.plant.name, "mode": mode, "seed": self.seed, "hidden": list(HIDDEN)}
         settings |= {key: self.size[key] for key in ("batch", "loops", "runs")}
         path, label = self.checkpoint(mode), f"{self.plant.name}, {mode}"
-        curve = train(policy, stages, path, settings=settings, validate=validate, every=EVERY, label=label)
+        curve = train(policy, stages, path, settings=settings, validate=validate, label=label)
         before = list(itertools.accumulate((stage.iterations for stage in stages), initial=0))
         return [
             {
@@ -141,10 +167,11 @@ class Training:
 
     def _validate_loop(self, policy: Any) -> Any:
         """Return what measures the error in closed loop from held-out states, relative to Algorithm 1's."""
-        starts = self.plant.starts(16, HELD_OUT + self.seed)
+        starts = self.plant.starts(VALIDATED_LOOPS, HELD_OUT)
 
         def error(attack: Any) -> float:
-            return float(self.plant.error(self.plant.loop(self.layer, attack, starts)[0]).mean())
+            outputs, _ = self.plant.loop(self.layer, attack, starts)
+            return float(self.plant.error(outputs, starts).mean())
 
         budgets = [attacks.RelativeBall(rho) for rho in self.plant.rhos]
         base = [error(attacks.LinearizedAttack(self.layer, self.plant.cost, budget)) for budget in budgets]
@@ -170,21 +197,19 @@ def compare(training: Training, modes: Sequence[str], seeds: int, workers: int) 
 
 def main(argv: list[str] | None = None) -> None:
     parser = arguments(__doc__, seeds=4)
-    parser.add_argument("--plant", choices=sorted(PLANTS), default="masses")
-    parser.add_argument("--mode", choices=[*MODES["masses"], "all"], default="all")
+    parser.add_argument("--plant", choices=sorted(judge.PLANTS), default="masses")
+    parser.add_argument("--mode", choices=[*MODES, "all"], default="all")
     parser.add_argument("--seed", type=int, default=0, help="of weights, recorded runs and batches (default 0)")
     parser.add_argument("--quick", action="store_true", help="a few iterations and runs, to see that it works")
     parser.add_argument("--restart", action="store_true", help="forget the checkpoints")
     parser.add_argument("--no-judging", action="store_true", help="train only")
     args = parser.parse_args(argv)
-    modes = MODES[args.plant] if args.mode == "all" else (args.mode,)
-    if not set(modes) <= set(MODES[args.plant]):
-        parser.error(f"PyBullet's dynamics have no derivative: the {args.plant} trains on windows only.")
+    modes = MODES if args.mode == "all" else (args.mode,)
     args.out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
     began = time.perf_counter()
     with process_group():
-        training = Training(args.plant, args.out, QUICK if args.quick else FULL, args.seed, args.workers)
+        training = Training(args.plant, args.out, QUICK if args.quick else FULL[args.plant], args.seed, args.workers)
         if args.restart:
             training.forget(modes)
         curves = [record for mode in modes for record in training.train(mode)]

@@ -243,7 +243,7 @@ pytest.importorskip("safetensors", reason="checkpoints are safetensors")
 
 import _adversary_training as training  # noqa: E402
 import train_adversary  # noqa: E402
-from _adversary_plants import Masses  # noqa: E402
+from _adversary_masses import Masses  # noqa: E402
 from _common import read_rows  # noqa: E402
 
 
@@ -277,7 +277,7 @@ def test_the_batched_loop_of_the_masses_is_simulate_and_so_is_its_derivative():
     network = attacks.AttackPolicy(layer.data, hidden=(8,), context=plant.context, generator=generator())
     attack = attacks.PolicyAttack(network, attacks.RelativeBall(0.05))
     y, seen = plant.loop(layer, attack, starts)
-    batched = torch.autograd.grad(plant.error(y).sum(), list(network.parameters()))
+    batched = torch.autograd.grad(plant.error(y, starts).sum(), list(network.parameters()))
     error = 0.0
     for i, start in enumerate(starts):
         log = dpc.simulate(
@@ -291,7 +291,7 @@ def test_the_batched_loop_of_the_masses_is_simulate_and_so_is_its_derivative():
             u_warmup=plant.u_ref,
         )
         torch.testing.assert_close(log.y, y[i], rtol=0, atol=1e-9)
-        error = error + plant.error(log.y)
+        error = error + plant.error(log.y, start)
     one_by_one = torch.autograd.grad(error, list(network.parameters()))
     for a, b in zip(batched, one_by_one, strict=True):
         assert relative(a, b) < 1e-6  # rounding grows on the way back through twenty plans
@@ -312,9 +312,9 @@ def tiny_training(path, stop_at=None):
         noise = randn(6, 2, seed=iteration)[share]
         return ((network.direction - 1 - noise) ** 2).sum() / 6
 
-    stages = [training.Stage("first", loss, 5, 0.1), training.Stage("second", loss, 9, 0.05, largest=0.5)]
+    stages = [training.Stage("first", loss, 5, 0.1, every=2), training.Stage("second", loss, 9, 0.05, 0.5, every=2)]
     curve = training.train(
-        network, stages, path, settings={"seed": 0}, validate=lambda: float(network.direction.detach().sum()), every=2
+        network, stages, path, settings={"seed": 0}, validate=lambda: float(network.direction.detach().sum())
     )
     return network.direction.detach(), curve
 
@@ -340,7 +340,7 @@ def test_checkpoints_of_other_settings_are_refused(tmp_path):
 def test_the_learning_rate_falls_and_large_gradients_are_cut(tmp_path):
     network = Constant(torch.zeros(1, 1).double())
     stage = training.Stage("only", lambda i, share: 100.0 * network.direction.sum(), 8, rate=0.1, largest=1e-3)
-    training.train(network, [stage], tmp_path / "a.safetensors", settings={}, every=100)
+    training.train(network, [stage], tmp_path / "a.safetensors", settings={})
     # Adam with a constant gradient steps by the rate itself: 0.1 (1 + cos(pi i / 8)) / 2, together 0.45
     assert float(network.direction.detach()) == pytest.approx(-0.45, rel=1e-3)  # eps over a gradient of 1e-3
 
@@ -415,16 +415,10 @@ def test_a_small_run_of_the_script(tmp_path):
     assert "| policy trained in closed loop |" in (tmp_path / "adversary_masses.md").read_text()
 
 
-def test_the_quadrotor_has_no_derivative_to_train_in_closed_loop(capsys):
-    with pytest.raises(SystemExit):
-        train_adversary.main(["--plant", "quadrotor", "--mode", "closed-loop"])
-    assert "no derivative" in capsys.readouterr().err
-
-
 @pytest.mark.slow
 def test_flights_are_recorded_the_same_by_any_number_of_processes():
     pytest.importorskip("pybullet", reason="the quadrotor flies in PyBullet")
-    from _adversary_plants import Quadrotor
+    from _adversary_quadrotor import Quadrotor
 
     one, two = (Quadrotor().record(3, 7, workers, every_step=False) for workers in (1, 2))
     for a, b in zip(one.tensors().values(), two.tensors().values(), strict=True):
