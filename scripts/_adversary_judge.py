@@ -20,6 +20,7 @@ from torch_dpc import attacks
 
 PLANTS = {"masses": Masses, "quadrotor": Quadrotor}
 PROJECTED, WINDOWS, CLOSED_LOOP = "projected_gradient", "windows", "closed-loop"
+AIMED, AIMED_PROJECTED = "algorithm1_tracking", "projected_gradient_tracking"
 TIMED_BATCH, REPEATS = 1024, 15
 NOISE_SEED = 1000
 HELD_OUT_WINDOWS = "held-out windows"
@@ -38,6 +39,17 @@ def contenders(layer: Any, cost: Any, budget: attacks.Budget, policies: dict[str
         POISON: attacks.LinearizedAttack(layer, cost, budget),
         PROJECTED: attacks.ProjectedGradientAttack(layer, cost, budget),
         **{mode: attacks.PolicyAttack(policy, budget) for mode, policy in policies.items()},
+    }
+
+
+def aimed_at_the_error(layer: Any, budget: attacks.Budget) -> dict[str, Any]:
+    """Return attacks that push the predicted true output away from its reference, as closed-loop training does."""
+    if not hasattr(attacks, "TrackingError"):
+        return {}
+    cost = attacks.TrackingError(layer.data, Q=layer.Q)
+    return {
+        AIMED: attacks.LinearizedAttack(layer, cost, budget),
+        AIMED_PROJECTED: attacks.ProjectedGradientAttack(layer, cost, budget, restarts=2),  # no gradient at rest
     }
 
 
@@ -103,7 +115,8 @@ def judge_run(plant_name: str, setting: str, seed: int, paths: dict[str, Path]) 
         policies = load_policies(paths, layer)
         yield NOMINAL, 0.0, None
         for rho in rhos:
-            for name, attack in contenders(layer, cost, attacks.RelativeBall(rho), policies).items():
-                yield name, rho, attack
+            budget = attacks.RelativeBall(rho)
+            both = contenders(layer, cost, budget, policies) | aimed_at_the_error(layer, budget)
+            yield from ((name, rho, attack) for name, attack in both.items())
 
     return [{"setting": setting, "seed": seed, **row} for row in plant.run(setting, seed, all_attacks)]

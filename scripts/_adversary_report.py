@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from _adversary_judge import CLOSED_LOOP, HELD_OUT_WINDOWS, PROJECTED, WINDOWS
+from _adversary_judge import AIMED, AIMED_PROJECTED, CLOSED_LOOP, HELD_OUT_WINDOWS, PROJECTED, WINDOWS
 from _common import NOMINAL, POISON, RANDOM, Array, Rows
 from _plots import COLOURS, plt, style
 
@@ -16,6 +16,8 @@ TITLES = {
     RANDOM: "random noise",
     POISON: "Algorithm 1",
     PROJECTED: "projected gradient, 20 steps",
+    AIMED: "Algorithm 1 at the tracking error",
+    AIMED_PROJECTED: "projected gradient at the tracking error",
     WINDOWS: "policy trained on windows",
     CLOSED_LOOP: "policy trained in closed loop",
 }
@@ -23,9 +25,12 @@ LOOKS = {
     RANDOM: {"color": COLOURS[RANDOM], "marker": "o"},
     POISON: {"color": COLOURS[POISON], "marker": "s"},
     PROJECTED: {"color": "#e69f00", "marker": "D"},
+    AIMED: {"color": COLOURS[POISON], "marker": "s", "markerfacecolor": "white"},
+    AIMED_PROJECTED: {"color": "#e69f00", "marker": "D", "markerfacecolor": "white"},
     WINDOWS: {"color": "#009e73", "marker": "^"},
     CLOSED_LOOP: {"color": "#35178c", "marker": "v"},
 }
+SHOWN = 400  # iterations of imitation in the picture
 HEAD = """# Trained adversaries: {plant}
 
 Decreases of psi are relative to Algorithm 1's on the same windows, recorded in closed loop with seeds of their own: the
@@ -39,9 +44,10 @@ def chosen(rows: Rows, column: str, setting: str, attack: str, rho: float) -> Ar
     return rows[column][(rows["setting"] == setting) & (rows["attack"] == attack) & np.isclose(rows["rho"], rho)]
 
 
-def names_in(rows: Rows) -> list[str]:
-    """Return the attacks that were made, in the order of `TITLES`."""
-    return [name for name in TITLES if name in set(rows["attack"]) and name != NOMINAL]
+def names_in(rows: Rows, setting: str) -> list[str]:
+    """Return the attacks that were made in a setting, in the order of `TITLES`."""
+    made = set(rows["attack"][rows["setting"] == setting])
+    return [name for name in TITLES if name in made and name != NOMINAL]
 
 
 def windows_table(rows: Rows, rhos: Sequence[float]) -> list[str]:
@@ -54,7 +60,7 @@ def windows_table(rows: Rows, rhos: Sequence[float]) -> list[str]:
         header(rhos, "median", "time a sample [us]", "Algorithm 1's / its", "alone [us]"),
         "|---" * (len(rhos) + 5) + "|",
     ]
-    for name in names_in(rows):
+    for name in names_in(rows, HELD_OUT_WINDOWS):
         share = [f"{100 * one('of_algorithm1', name, rho):.1f} %" for rho in rhos]
         median = [100 * one("median_of_algorithm1", name, rho) for rho in rhos]
         times = {n: one("microseconds", n, rhos[0]) for n in (name, POISON)}
@@ -74,7 +80,7 @@ def loop_table(rows: Rows, rhos: Sequence[float], setting: str) -> list[str]:
         header(rhos, "failed"),
         "|---" * (len(rhos) + 2) + "|",
     ]
-    for name in names_in(rows):
+    for name in names_in(rows, setting):
         cells, failed = [], 0
         for rho in rhos:
             error, base = (chosen(rows, "mean_error", setting, n, rho) for n in (name, POISON))
@@ -110,13 +116,17 @@ def picture(path: Path, rows: Rows, curves: Rows, rhos: Sequence[float]) -> None
     figure, (left, middle, right) = plt.subplots(1, 3, figsize=(10.2, 3.6))
     for mode in dict.fromkeys(curves["mode"]):
         mine = curves["mode"] == mode
-        left.plot(curves["total"][mine], curves["of_algorithm1"][mine], **{**LOOKS[mode], "marker": "None"})
+        imitated = curves["total"][mine & (curves["stage"] == "imitate")].max()
+        left.plot(curves["total"][mine] - imitated, curves["of_algorithm1"][mine], **{**LOOKS[mode], "marker": "None"})
     left.axhline(1.0, color=COLOURS[POISON], linestyle=(0, (4, 2)))
-    imitated = curves["total"][curves["stage"] == "imitate"].max()
-    left.axvline(imitated, color="grey", linestyle=":")
-    left.annotate("own aim ", (imitated, 0.5), xycoords=("data", "axes fraction"), rotation=90, ha="right", va="center")
-    left.set(title="training, on held-out data", xlabel="iteration", ylabel="effect relative to Algorithm 1")
-    for name in names_in(rows):
+    left.axvline(0.0, color="grey", linestyle=":")
+    left.set(xlim=(-SHOWN, None))
+    left.set(
+        title="training, on held-out data",
+        xlabel="iteration after the imitation",
+        ylabel="effect relative to Algorithm 1",
+    )
+    for name in names_in(rows, HELD_OUT_WINDOWS):
         points = [
             [float(chosen(rows, column, HELD_OUT_WINDOWS, name, rho)[0]) for rho in rhos]
             for column in ("microseconds", "of_algorithm1")
@@ -127,9 +137,9 @@ def picture(path: Path, rows: Rows, curves: Rows, rhos: Sequence[float]) -> None
         title="held-out windows", xscale="log", xlabel="time a sample [µs]", ylabel="decrease of psi / Algorithm 1's"
     )
     setting = next(s for s in dict.fromkeys(rows["setting"]) if s != HELD_OUT_WINDOWS)
-    for name in names_in(rows):
+    for name in names_in(rows, setting):
         errors = np.array([chosen(rows, "mean_error", setting, name, rho) for rho in rhos])
-        right.plot(100 * np.array(rhos), errors.mean(axis=1), **LOOKS[name])
+        right.plot(100 * np.array(rhos), errors.mean(axis=1), label=TITLES[name], **LOOKS[name])
         right.fill_between(
             100 * np.array(rhos), errors.min(axis=1), errors.max(axis=1), color=LOOKS[name]["color"], alpha=0.15
         )
