@@ -42,11 +42,11 @@ def contenders(layer: Any, cost: Any, budget: attacks.Budget, policies: dict[str
     }
 
 
-def aimed_at_the_error(layer: Any, budget: attacks.Budget) -> dict[str, Any]:
+def aimed_at_the_error(layer: Any, judged: Any, budget: attacks.Budget) -> dict[str, Any]:
     """Return attacks that push the predicted true output away from its reference, as closed-loop training does."""
     if not hasattr(attacks, "TrackingError"):
         return {}
-    cost = attacks.TrackingError(layer.data, Q=layer.Q)
+    cost = attacks.TrackingError(layer.data, Q=judged)
     return {
         AIMED: attacks.LinearizedAttack(layer, cost, budget),
         AIMED_PROJECTED: attacks.ProjectedGradientAttack(layer, cost, budget, restarts=2),  # no gradient at rest
@@ -116,7 +116,7 @@ def judge_run(plant_name: str, setting: str, seed: int, paths: dict[str, Path]) 
         yield NOMINAL, 0.0, None
         for rho in rhos:
             budget = attacks.RelativeBall(rho)
-            both = contenders(layer, cost, budget, policies) | aimed_at_the_error(layer, budget)
+            both = contenders(layer, cost, budget, policies) | aimed_at_the_error(layer, plant.judged, budget)
             yield from ((name, rho, attack) for name, attack in both.items())
 
     return [{"setting": setting, "seed": seed, **row} for row in plant.run(setting, seed, all_attacks)]

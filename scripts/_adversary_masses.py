@@ -39,6 +39,7 @@ class Masses:
     cost = attacks.TargetInput(trajectory=figure3_masses.target(0.1))
     context = cost.target
     settings = ("at rest", "disturbed")
+    judged = torch.diag(torch.tensor([1.0, 0.0, 0.0, 0.0]))  # weights of the outputs in the error
 
     def __init__(self) -> None:
         self.plant = dpc.systems.OscillatingMasses()

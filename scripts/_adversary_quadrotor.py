@@ -61,6 +61,7 @@ class Quadrotor:
     cost = attacks.TargetInput(figure4_quadrotor.TARGET.double())
     context = None
     settings = ("known controller", "unknown controller")
+    judged = torch.diag(torch.tensor([1.0, 1.0, 1.0, 0.0, 0.0, 0.0]))  # weights of the outputs in the error
 
     def starts(self, n: int, seed: int) -> Tensor:
         """Return the steps of the circle at which laps begin, `(n,)`."""
