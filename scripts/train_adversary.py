@@ -36,7 +36,7 @@ from _adversary_training import Stage, process_group, rank, read_tensors, train,
 from _common import arguments, read_rows, run_all, versions, write_rows
 from torch_dpc import attacks
 
-HIDDEN = (32, 32)
+HIDDEN = [32, 32]
 # Iterations of each stage, windows and closed loops an iteration, runs recorded for training and for judging.
 FULL = {
     "masses": {
@@ -76,10 +76,14 @@ class Training:
         size: an entry of `FULL`, or `QUICK`.
         seed: of the first weights, the recorded runs and the batches.
         workers: processes that record.
+        hidden: width of each hidden layer.
     """
 
-    def __init__(self, plant: str, out: Path, size: dict[str, Any], seed: int, workers: int):
+    def __init__(
+        self, plant: str, out: Path, size: dict[str, Any], seed: int, workers: int, hidden: Sequence[int] = HIDDEN
+    ):
         self.plant, self.out, self.size, self.seed, self.workers = judge.PLANTS[plant](), out, size, seed, workers
+        self.hidden = hidden
         self.layer = self.plant.layer(TRAINING)
         self.windows = self._recorded("recording", 1000 * (1 + seed), size["runs"], every_step=True)
         self.held_out = self._recorded("held_out", HELD_OUT, size["kept"], every_step=False)
@@ -102,7 +106,7 @@ class Training:
         policy = attacks.AttackPolicy.for_windows(
             self.layer.data,
             (w.u_ini, w.y_ini, w.y_ref, w.u_ref, w.step),
-            hidden=HIDDEN,
+            hidden=self.hidden,
             context=self.plant.context,
             generator=torch.Generator().manual_seed(self.seed),
         )
@@ -120,7 +124,7 @@ class Training:
                 Stage("closed loop", loss, size["loop"], RATE["loop"], LARGEST_GRADIENT, every=5),
             ]
             validate = self._validate_loop(policy)
-        settings = {"plant": self.plant.name, "mode": mode, "seed": self.seed, "hidden": list(HIDDEN)}
+        settings = {"plant": self.plant.name, "mode": mode, "seed": self.seed, "hidden": list(self.hidden)}
         settings |= {key: self.size[key] for key in ("batch", "loops", "runs")}
         path, label = self.checkpoint(mode), f"{self.plant.name}, {mode}"
         curve = train(policy, stages, path, settings=settings, validate=validate, label=label)
@@ -200,6 +204,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--plant", choices=sorted(judge.PLANTS), default="masses")
     parser.add_argument("--mode", choices=[*MODES, "all"], default="all")
     parser.add_argument("--seed", type=int, default=0, help="of weights, recorded runs and batches (default 0)")
+    parser.add_argument("--hidden", type=int, nargs="*", default=HIDDEN, help="width of each hidden layer")
     parser.add_argument("--quick", action="store_true", help="a few iterations and runs, to see that it works")
     parser.add_argument("--restart", action="store_true", help="forget the checkpoints")
     parser.add_argument("--no-judging", action="store_true", help="train only")
@@ -209,7 +214,9 @@ def main(argv: list[str] | None = None) -> None:
     torch.set_num_threads(1)
     began = time.perf_counter()
     with process_group():
-        training = Training(args.plant, args.out, QUICK if args.quick else FULL[args.plant], args.seed, args.workers)
+        training = Training(
+            args.plant, args.out, QUICK if args.quick else FULL[args.plant], args.seed, args.workers, args.hidden
+        )
         if args.restart:
             training.forget(modes)
         curves = [record for mode in modes for record in training.train(mode)]

@@ -13,7 +13,6 @@ import torch
 import torch_dpc as dpc
 from helpers import HOLDING, Y_REF, generator, randn, relative, small_data, small_layer, windows
 from torch_dpc import attacks
-from torch_dpc.attacks.network import principal_axes
 
 SCRIPTS = Path(__file__).resolve().parent.parent / "scripts"
 sys.path.insert(0, str(SCRIPTS))
@@ -206,13 +205,23 @@ def test_the_context_is_windowed_by_the_step():
         torch.testing.assert_close(together[i], network(u_ini[i], y_ini[i], step=k), rtol=EXACT, atol=EXACT)
 
 
-def test_principal_axes_have_one_size_and_leave_out_what_does_not_vary():
-    x = randn(200, 3, seed=1) @ randn(3, 6, seed=2) * torch.tensor([1.0, 1e3, 1e-3, 1.0, 1.0, 0.0]) + 5.0
-    mean, whiten = principal_axes(x.double())
-    assert whiten.shape == (6, 3) and not whiten[5].any()
-    z = (x - mean) @ whiten
-    torch.testing.assert_close(z.T @ z / 200, torch.eye(3).double(), rtol=0, atol=1e-9)
-    assert z.mean(0).abs().max() < 1e-9
+def test_every_channel_is_seen_at_the_size_1_whatever_its_unit():
+    u_ini, y_ini = windows(50, 3, seed=1)
+    run, step = randn(60, 2, seed=3), torch.arange(50)
+    unit = torch.tensor([1.0, 1e3, 1e-3, 1.0]).double()  # the second output in mm, the third in km/s
+    options = {"hidden": (8,), "looks": 3, "context": run}
+    plain, scaled = (
+        attacks.AttackPolicy.for_windows(
+            small_data(), (u_ini, y * k, Y_REF * k, None, step), **options, generator=generator()
+        )
+        for y, k in ((y_ini, 1.0), (y_ini, unit))
+    )
+    z = torch.cat([part.expand(50, -1) for part in plain._parts(u_ini, y_ini, Y_REF, None, step)], dim=1) / plain.scale
+    channels = z[:, 6:18].reshape(150, 4)  # of y_ini
+    torch.testing.assert_close(channels.square().mean(0), torch.ones(4).double(), rtol=EXACT, atol=0)
+    assert torch.equal(plain.scale[18:24], torch.ones(6).double())  # u_ref is idle
+    seen = plain(u_ini, y_ini, Y_REF, None, step)
+    torch.testing.assert_close(scaled(u_ini, y_ini * unit, Y_REF * unit, None, step), seen, rtol=1e-9, atol=1e-9)
 
 
 def test_weights_come_from_the_generator_alone():

@@ -14,20 +14,16 @@ from torch import Tensor, nn
 from ..checks import as_data, check_count, reference, window
 from ..hankel import HankelData
 
-#: Principal axes of the inputs that vary less than this, relative to the strongest, are left out.
-NEGLIGIBLE = 1e-3
-
 
 class AttackPolicy(nn.Module):
     """A small network from what an attacker measures to a direction of attack.
 
-        z = (x - mean) whiten,   x = (u_ini, y_ini, u_ref, y_ref, context of the step)
+        z = x / scale,   x = (u_ini, y_ini, u_ref, y_ref, context of the step)
         d = W z + b + W_k relu(... relu(W_1 z + b_1) ...)
 
     Algorithm 1's direction is, before it is normalised, piecewise affine in x: the gradient of a quadratic through a
     plan that is piecewise affine. So is this map, and the way around the hidden layers is all of it where no bound
-    becomes active. Build it with `for_windows`, which whitens by the principal axes of recorded inputs: a velocity is a
-    small difference of large positions, and unwhitened the network does not find it.
+    becomes active. Build it with `for_windows`, which brings every channel to the size 1, so that units do not matter.
 
     Args:
         data: what the sizes of the windows are taken from.
@@ -35,7 +31,7 @@ class AttackPolicy(nn.Module):
         context: what else moves with the step and decides the attack, `(>= steps, n)`, such as the trajectory of a
             `TargetInput`, its last row held beyond the end.
         looks: at how many steps of the horizon, evenly spread, it looks at the references and the context.
-        whitening: mean `(n_x,)` and whiten `(n_x, features)`; by default z = x.
+        scale: of each entry of x, `(n_x,)`; by default 1.
         generator: of the first weights.
 
     Example:
@@ -47,8 +43,7 @@ class AttackPolicy(nn.Module):
         torch.Size([3, 2, 1])
     """
 
-    mean: Tensor
-    whiten: Tensor
+    scale: Tensor
     context: Tensor | None
     looks: Tensor
 
@@ -59,7 +54,7 @@ class AttackPolicy(nn.Module):
         hidden: Sequence[int] = (32, 32),
         context: Any = None,
         looks: int = 5,
-        whitening: tuple[Tensor, Tensor] | None = None,
+        scale: Tensor | None = None,
         generator: torch.Generator | None = None,
     ):
         super().__init__()
@@ -69,22 +64,22 @@ class AttackPolicy(nn.Module):
             raise ValueError(f"`context` must have shape (>= steps, n), got {tuple(context.shape)}.")
         looks = min(looks, data.horizon)
         self.data_sizes = data.t_ini, data.horizon, data.n_u, data.n_y
-        past, future = (data.n_u, data.n_y), (data.n_u, data.n_y, 0 if context is None else context.shape[1])
-        #: Entries of the parts of x.
-        self.sizes = [*(data.t_ini * n for n in past), *(looks * n for n in future)]
+        past, ahead = (data.n_u, data.n_y), (data.n_u, data.n_y, *(() if context is None else context.shape[1:]))
+        #: Channels and entries of the parts of x.
+        self.channels = [*past, *ahead]
+        self.sizes = [*(data.t_ini * n for n in past), *(looks * n for n in ahead)]
         n_x, out = sum(self.sizes), data.t_ini * data.n_y
-        if whitening is None:
-            whitening = torch.zeros(n_x, dtype=torch.float64), torch.eye(n_x, dtype=torch.float64)
-        for name, value in (("context", context), *zip(("mean", "whiten"), whitening, strict=True)):
+        scale = torch.ones(n_x, dtype=torch.float64) if scale is None else scale
+        for name, value in (("context", context), ("scale", scale)):
             self.register_buffer(name, None if value is None else value.clone(memory_format=torch.contiguous_format))
         self.register_buffer("looks", torch.linspace(0, data.horizon - 1, looks).round().long(), persistent=False)
-        self.skip = _linear(self.whiten.shape[1], out, generator)
-        widths = [self.whiten.shape[1], *hidden, out] if hidden else []
+        self.skip = _linear(n_x, out, generator)
+        widths = [n_x, *hidden, out] if hidden else []
         self.hidden = nn.ModuleList(_linear(n, m, generator) for n, m in itertools.pairwise(widths))
 
     @classmethod
     def for_windows(cls, data: HankelData, recorded: Sequence[Any], **options: Any) -> AttackPolicy:
-        """Return a policy that is whitened for recorded inputs.
+        """Return a policy scaled by recorded inputs: by the root mean square of each channel, an idle one by 1.
 
         Args:
             data: as for the constructor.
@@ -92,18 +87,21 @@ class AttackPolicy(nn.Module):
             options: `hidden`, `context`, `looks` and `generator` of the constructor.
         """
         seen = {key: value for key, value in options.items() if key in ("context", "looks")}
-        parts = cls(data, hidden=(), **seen)._parts(*recorded)
-        batch = max(len(part) for part in parts if part.ndim == 2)
-        return cls(data, whitening=principal_axes(torch.cat([p.expand(batch, -1) for p in parts], dim=1)), **options)
+        raw = cls(data, hidden=(), **seen)
+        scales = []
+        for part, channels in zip(raw._parts(*recorded), raw.channels, strict=True):
+            size = part.reshape(-1, channels).square().mean(0).sqrt()
+            scales.append(torch.where(size > 0, size, 1.0).repeat(part.shape[-1] // channels))
+        return cls(data, scale=torch.cat(scales), **options)
 
     @classmethod
     def from_state_dict(cls, data: HankelData, state: Mapping[str, Tensor]) -> AttackPolicy:
         """Return the policy of a `state_dict`, whatever its widths; data as for the constructor."""
         widths = [len(tensor) for name, tensor in state.items() if re.fullmatch(r"hidden\.\d+\.bias", name)]
-        context, whitening = state.get("context"), (state["mean"], state["whiten"])
+        context, scale = state.get("context"), state["scale"]
         channels = data.n_u + data.n_y + (0 if context is None else context.shape[1])
-        looks = (len(state["mean"]) - data.t_ini * (data.n_u + data.n_y)) // channels
-        policy = cls(data, hidden=widths[:-1], context=context, looks=looks, whitening=whitening)
+        looks = (len(scale) - data.t_ini * (data.n_u + data.n_y)) // channels
+        policy = cls(data, hidden=widths[:-1], context=context, looks=looks, scale=scale)
         policy.load_state_dict(state)
         return policy
 
@@ -116,8 +114,8 @@ class AttackPolicy(nn.Module):
             step: of the run, an integer, or one for each sample, `(*batch,)`.
         """
         layers = [self.skip, *self.hidden[:1]]
-        first = self.whiten @ torch.cat([layer.weight for layer in layers]).mT  # the first layers, as a map of x
-        total = torch.cat([layer.bias for layer in layers]) - self.mean @ first
+        first = (torch.cat([layer.weight for layer in layers]) / self.scale).mT  # the first layers, as a map of x
+        total = torch.cat([layer.bias for layer in layers])
         for part, rows in zip(self._parts(u_ini, y_ini, y_ref, u_ref, step), first.split(self.sizes), strict=True):
             total = total + part @ rows
         direction, z = total.split((self.skip.out_features, total.shape[-1] - self.skip.out_features), dim=-1)
@@ -135,33 +133,10 @@ class AttackPolicy(nn.Module):
             reference("u_ref", u_ref, horizon, n_u, "n_u", u_ini)[..., self.looks, :],
             reference("y_ref", y_ref, horizon, n_y, "n_y", y_ini)[..., self.looks, :],
         ]
-        if self.context is None:
-            ahead.append(self.whiten.new_zeros(len(self.looks), 0))
-        else:
+        if self.context is not None:
             rows = torch.as_tensor(step, device=self.looks.device)[..., None] + self.looks
             ahead.append(self.context[rows.clamp(max=len(self.context) - 1)])
-        return [part.flatten(-2).to(self.whiten) for part in (u_ini, y_ini, *ahead)]
-
-
-def principal_axes(x: Tensor, negligible: float = NEGLIGIBLE) -> tuple[Tensor, Tensor]:
-    """Return the mean and the map that gives every principal axis of x the variance 1.
-
-    Entries are brought to one scale first, so units do not matter; constant entries and axes along which x hardly
-    varies are left out.
-
-    Args:
-        x: `(samples, n)`.
-        negligible: relative to the strongest axis.
-
-    Returns:
-        mean `(n,)` and whiten `(n, axes)`: z = (x - mean) whiten.
-    """
-    mean, scale = x.mean(0), x.std(0, correction=0)
-    varies = scale > 1e-9 * (mean.abs() + scale)
-    unit = torch.where(varies, 1 / torch.where(varies, scale, 1.0), 0.0)
-    _, size, axes = torch.linalg.svd((x - mean) * unit, full_matrices=False)
-    kept = size > negligible * size[0]
-    return mean, unit[:, None] * axes[kept].mT * (len(x) ** 0.5 / size[kept])
+        return [part.flatten(-2).to(self.scale) for part in (u_ini, y_ini, *ahead)]
 
 
 def _linear(n: int, m: int, generator: torch.Generator | None) -> nn.Linear:
