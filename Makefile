@@ -49,14 +49,14 @@ distclean: clean  ## remove .venv too
 
 # The stamp is written last, so an install that failed or was interrupted is taken up again by the next run.
 # An environment without a working pip was cut short before it was of use to anybody: it is begun anew.
-$(ENV): setup.cfg constraints.txt
+$(ENV): setup.cfg setup.py constraints.txt torch_dpc/_kernels.c $(wildcard torch_dpc/*.h)
 	@$(PY) -m pip --version >/dev/null 2>&1 || { \
 	test -n "$(PYTHON)" || { echo "Python 3.11 was not found: install it, or name one with make PYTHON=..."; exit 1; }; \
 	echo "Creating .venv with $(PYTHON) (about 2 minutes the first time) ..."; $(PYTHON) -m venv --clear .venv; }
 	@echo "[1/4] PyTorch ..."
 	@$(PIP) setuptools torch
 	@echo "[2/4] torch_dpc, test tools, plotting ..."
-	@$(PIP) -e '.[scripts,dev]'
+	@$(PIP) -e '.[scripts,dev,save]'
 	@echo "[3/4] quadrotor simulator ..."
 	@$(PIP) -e '.[quadrotor]' || $(call without,the quadrotor)
 	@echo "[4/4] baselines ..."

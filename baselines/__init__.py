@@ -57,8 +57,8 @@ class Peer:
 
 #: QPLayer's backward is itself iterative and stops at 1e-4 by default; with these it is as exact as it can be.
 QPLAYER_TIGHT = {"eps_backward": 1e-10, "rho_backward": 1e-10, "mu_backward": 1e-10}
-#: The conic solvers of diffcp with its derivative modes: Clarabel with each, the others with the default.
-DIFFCP_SETTINGS = (("Clarabel", "lsqr"), ("Clarabel", "lsmr"), ("Clarabel", "dense"), ("ECOS", "lsqr"), ("SCS", "lsqr"))
+#: The conic solvers of diffcp with each of its derivative modes.
+DIFFCP_SETTINGS = tuple((method, mode) for method in ("Clarabel", "ECOS", "SCS") for mode in ("lsqr", "lsmr", "dense"))
 #: PIQP's defaults stop at 1e-8 and leave 1e-4 in the solution.
 FORWARD_ONLY_SETTINGS = {"piqp": {"eps_abs": 1e-12, "eps_rel": 1e-12}}
 

@@ -8,10 +8,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from torch_dpc import Box, DPCLayer
+from torch_dpc import Box, DPCLayer, HankelData
 from torch_dpc.checks import is_finite
-from torch_dpc.problem import Sizes, penalty, projector, weight_matrix
-from torch_dpc.reduction import Reduction, psd_root
+from torch_dpc.problem import Sizes, projector
+from torch_dpc.reduction import Reduction
+from torch_dpc.rows import Terms
+from torch_dpc.weights import penalty, psd_root, weight_matrix
 
 #: Keeps 0 / 0 at 0.
 _TINY = 1e-300
@@ -37,14 +39,23 @@ def bounds_of(layer: DPCLayer) -> tuple[Tensor, Tensor]:
     """Return the bounds of v = (u, y) on the CPU, `(N,)`.
 
     Raises:
-        ValueError: a set is no box.
+        ValueError: a set is no box, or the problem is not the paper's.
     """
+    if layer.terms != Terms():
+        raise ValueError(f"the baselines take the paper's problem, got one with {layer.terms}.")
     if not (isinstance(layer.u_set, Box) and isinstance(layer.y_set, Box)):
         names = f"{type(layer.u_set).__name__} and {type(layer.y_set).__name__}"
         raise ValueError(f"the baselines take boxes as `u_set` and `y_set`, got {names}.")
     with torch.no_grad():
         lower, upper = layer.bounds(torch.device("cpu"))
     return lower, upper
+
+
+def data_of(layer: DPCLayer) -> HankelData:
+    """Return the data of a layer of one problem."""
+    if not isinstance(layer.data, HankelData):
+        raise ValueError("the baselines take one problem; the layer has a batch of data sets.")
+    return layer.data
 
 
 class CostRows(NamedTuple):
@@ -59,7 +70,7 @@ class CostRows(NamedTuple):
 
 def cost_rows_of(layer: DPCLayer) -> CostRows:
     """Return sqrt(R), sqrt(Q), sqrt(2 lambda_g) M, sqrt(2 lambda_s) Yp and sqrt(2 lambda_s)."""
-    data = layer.data
+    data = data_of(layer)
     with torch.no_grad():
         root_g, root_s = (
             (2 * penalty(name, value)).sqrt()

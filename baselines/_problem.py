@@ -190,7 +190,7 @@ def _reduced(layer: DPCLayer) -> QP:
     rows = _finite_rows(lower, upper)
     V, Ct = reduction.V, reduction.Ct
     eye = torch.eye(Ct.shape[1], dtype=Ct.dtype)
-    basis = layer.data.row_space.basis.cpu()
+    basis = layer.data.basis.cpu()
     return QP(
         P=eye,
         A=Ct.new_zeros(0, Ct.shape[1]),

@@ -44,8 +44,6 @@ def contenders(layer: Any, cost: Any, budget: attacks.Budget, policies: dict[str
 
 def aimed_at_the_error(layer: Any, judged: Any, budget: attacks.Budget) -> dict[str, Any]:
     """Return attacks that push the predicted true output away from its reference, as closed-loop training does."""
-    if not hasattr(attacks, "TrackingError"):
-        return {}
     cost = attacks.TrackingError(layer.data, Q=judged)
     return {
         AIMED: attacks.LinearizedAttack(layer, cost, budget),

@@ -25,11 +25,11 @@ a reference in extended precision (`scripts/_reference.py`) whose own error is e
 def write_report(out: Path, lines: list[Line]) -> str:
     """Write benchmark.md and benchmark.png; return the first table."""
     shown = [line for line in lines if line["scaling"] == "False"]
-    head = ["# Benchmark", "", *_made_with(lines), "", _how(lines)]
-    first = ["## torch_dpc against the others", "", *_ratios(shown)]
-    body = [*_scaling([line for line in lines if line["scaling"] == "True"]), *_all(shown)]
+    head = ["# Benchmark", "", *made_with(lines), "", _how(lines)]
+    first = ["## torch_dpc against the others", "", *ratios(shown)]
+    body = [*scaling([line for line in lines if line["scaling"] == "True"]), *_all(shown)]
     (out / "benchmark.md").write_text("\n".join([*head, "", *first, "", *body]) + "\n")
-    chosen = _of(shown, plant="masses", horizon="25", batch="1")
+    chosen = of(shown, plant="masses", horizon="25", batch="1")
     drawn = [line for line in chosen if line["gradient_error"] and line["both_ms"]]
     if drawn:
         scatter(out / "benchmark.png", drawn, [_why(line) for line in chosen if _lacks_gradient(line)])
@@ -47,7 +47,8 @@ def _why(line: Line) -> str:
     return f"{line['name']}, {line['status']}"
 
 
-def _made_with(lines: list[Line]) -> list[str]:
+def made_with(lines: list[Line]) -> list[str]:
+    """Say with what the lines were measured."""
     told = []
     for names in (("processor", "threads", "seed", "mode"), ("versions",)):
         parts = [f"{name} {' or '.join(dict.fromkeys(line[name] for line in lines))}" for name in names]
@@ -60,30 +61,31 @@ def _how(lines: list[Line]) -> str:
     return HOW.format(reference=f"{max(known):.0e}" if known else "an unknown amount")
 
 
-def _ratios(lines: list[Line]) -> list[str]:
+def ratios(lines: list[Line]) -> list[str]:
     """The layer with its default engine, beside the loop over DAQP and the fastest differentiable peer."""
-    if not _of(lines, name="torch_dpc"):
+    if not of(lines, name="torch_dpc"):
         return ["(no row of torch_dpc itself)"]
     header = ["plant", "horizon", "batch", "forward", "a problem [us]", "DAQP loop", "ratio", "both", "a problem [us]"]
     header += ["gradient error", "fastest differentiable peer", "its both", "ratio", "its gradient error"]
     rows = []
-    for ours in _of(lines, name="torch_dpc"):
-        same = _of(lines, plant=ours["plant"], horizon=ours["horizon"], batch=ours["batch"])
-        loop = next(iter(_of(same, name=LOOP)), None)
+    for ours in of(lines, name="torch_dpc"):
+        same = of(lines, plant=ours["plant"], horizon=ours["horizon"], batch=ours["batch"])
+        loop = next(iter(of(same, name=LOOP)), None)
         peers = [line for line in same if line["name"] not in OURS and line["both_ms"] and line["status"] == "ok"]
         peer = min(peers, key=lambda line: float(line["both_ms"]), default=None)
-        row = [ours["plant"], ours["horizon"], ours["batch"], _number(ours["forward_ms"]), _each(ours, "forward_ms")]
-        row += [_number(loop["forward_ms"]), _ratio(loop, ours, "forward_ms")] if loop else ["", ""]
-        row += [_number(ours["both_ms"]), _each(ours, "both_ms"), _number(ours["gradient_error"], ".0e")]
-        row += [peer["name"], _number(peer["both_ms"]), _ratio(peer, ours, "both_ms")] if peer else [""] * 3
-        rows.append([*row, _number(peer["gradient_error"], ".0e") if peer else ""])
-    lead = _table(header, rows, left=("plant", "fastest differentiable peer"))
-    return [*lead, "", *_cvxpylayers(lines), "A ratio is theirs to ours: above 1, torch_dpc is faster."]
+        row = [ours["plant"], ours["horizon"], ours["batch"], number(ours["forward_ms"]), each(ours, "forward_ms")]
+        row += [number(loop["forward_ms"]), ratio(loop, ours, "forward_ms")] if loop else ["", ""]
+        row += [number(ours["both_ms"]), each(ours, "both_ms"), number(ours["gradient_error"], ".0e")]
+        row += [peer["name"], number(peer["both_ms"]), ratio(peer, ours, "both_ms")] if peer else [""] * 3
+        rows.append([*row, number(peer["gradient_error"], ".0e") if peer else ""])
+    lead = table(header, rows, left=("plant", "fastest differentiable peer"))
+    return [*lead, "", *cvxpylayers(lines), "A ratio is theirs to ours: above 1, torch_dpc is faster."]
 
 
-def _cvxpylayers(lines: list[Line]) -> list[str]:
-    chosen = _of(lines, plant="masses", horizon="25", batch="1")
-    ours = next((line for line in _of(chosen, name="torch_dpc") if line["both_ms"]), None)
+def cvxpylayers(lines: list[Line]) -> list[str]:
+    """The layer beside the fastest configuration of cvxpylayers on the QP as printed."""
+    chosen = of(lines, plant="masses", horizon="25", batch="1")
+    ours = next((line for line in of(chosen, name="torch_dpc") if line["both_ms"]), None)
     theirs = [line for line in chosen if "cvxpylayers" in line["name"] and "(paper)" in line["name"]]
     theirs = [line for line in theirs if line["both_ms"] and line["status"] == "ok"]
     if ours is None or not theirs:
@@ -91,23 +93,24 @@ def _cvxpylayers(lines: list[Line]) -> list[str]:
     best = min(theirs, key=lambda line: float(line["both_ms"]))
     return [
         f"On the masses' QP as the paper prints it (horizon 25, batch 1) the fastest of {len(theirs)} cvxpylayers "
-        f"configurations measured, {best['name']}, takes {_ratio(best, ours, 'both_ms')} times as long, "
-        f"with a gradient error of {_number(best['gradient_error'], '.0e')}.",
+        f"configurations measured, {best['name']}, takes {ratio(best, ours, 'both_ms')} times as long, "
+        f"with a gradient error of {number(best['gradient_error'], '.0e')}.",
         "",
     ]
 
 
-def _scaling(lines: list[Line]) -> list[str]:
+def scaling(lines: list[Line]) -> list[str]:
+    """The rows that let n_g grow."""
     if not lines:
         return []
     header = ["recorded windows n_g", "setup [s]", "memory [MB]", "forward", "ratio to n_g = 500", "solution error"]
     rows = []
     for line in sorted(lines, key=lambda line: int(line["n_g"])):
-        setup = _number(str(float(line["setup_ms"]) / 1e3)) if line["setup_ms"] else line["status"]
-        row = [line["n_g"], setup, _number(line["peak_mb"]), _spread(line, "forward"), _number(line["ratio"], ".2f")]
-        rows.append([*row, _number(line["solution_error"], ".0e")])
+        setup = number(str(float(line["setup_ms"]) / 1e3)) if line["setup_ms"] else line["status"]
+        row = [line["n_g"], setup, number(line["peak_mb"]), _spread(line, "forward"), number(line["ratio"], ".2f")]
+        rows.append([*row, number(line["solution_error"], ".0e")])
     text = "The masses at horizon 25, batch 1; the layer on 500 windows is called turn by turn beside each."
-    return ["## More recorded windows", "", *_table(header, rows), "", text, ""]
+    return ["## More recorded windows", "", *table(header, rows), "", text, ""]
 
 
 def _all(lines: list[Line]) -> list[str]:
@@ -117,19 +120,20 @@ def _all(lines: list[Line]) -> list[str]:
     problems = dict.fromkeys((line["plant"], int(line["horizon"]), int(line["batch"])) for line in lines)
     for plant, horizon, batch in sorted(problems):
         rows = []
-        for line in _of(lines, plant=plant, horizon=str(horizon), batch=str(batch)):
-            each = _each(line, "both_ms") or _each(line, "forward_ms")
-            row = [line["name"], _number(line["setup_ms"])]
+        for line in of(lines, plant=plant, horizon=str(horizon), batch=str(batch)):
+            time = each(line, "both_ms") or each(line, "forward_ms")
+            row = [line["name"], number(line["setup_ms"])]
             row += [_spread(line, stage) for stage in ("forward", "backward", "both")]
-            row += [each, _number(line["peak_mb"]), line["kkt_size"]]
-            row += [_number(line[f"{name}_error"], ".0e") for name in ("solution", "gradient")]
-            rows.append([*row, line["repeats"], _remark(line)])
+            row += [time, number(line["peak_mb"]), line["kkt_size"]]
+            row += [number(line[f"{name}_error"], ".0e") for name in ("solution", "gradient")]
+            rows.append([*row, line["repeats"], remark(line)])
         out += [f"## {plant}, horizon {horizon}, batch {batch}", ""]
-        out += [*_table(header, rows, left=("solver", "remarks")), ""]
+        out += [*table(header, rows, left=("solver", "remarks")), ""]
     return out
 
 
-def _remark(line: Line) -> str:
+def remark(line: Line) -> str:
+    """Return how a row ended where that was not well, and the message that came with it."""
     status = "" if line["status"] == "ok" else line["status"]
     message = line["message"].replace("|", "/").replace("\n", " ")
     message = message if len(message) <= 120 else message[:117] + "..."
@@ -139,11 +143,11 @@ def _remark(line: Line) -> str:
 # --- cells -----------------------------------------------------------------------------------------------------------
 
 
-def _of(lines: Iterable[Line], **values: str) -> list[Line]:
+def of(lines: Iterable[Line], **values: str) -> list[Line]:
     return [line for line in lines if all(line[name] == value for name, value in values.items())]
 
 
-def _number(cell: str, form: str = ".3g") -> str:
+def number(cell: str, form: str = ".3g") -> str:
     if not cell:
         return ""
     value = float(cell)
@@ -153,18 +157,18 @@ def _number(cell: str, form: str = ".3g") -> str:
 def _spread(line: Line, stage: str) -> str:
     if not line[f"{stage}_ms"]:
         return ""
-    low, high = _number(line[f"{stage}_q1"]), _number(line[f"{stage}_q3"])
-    return _number(line[f"{stage}_ms"]) + (f" ({low} to {high})" if low != high else "")
+    low, high = number(line[f"{stage}_q1"]), number(line[f"{stage}_q3"])
+    return number(line[f"{stage}_ms"]) + (f" ({low} to {high})" if low != high else "")
 
 
-def _each(line: Line, time: str) -> str:
-    return _number(str(1e3 * float(line[time]) / int(line["batch"]))) if line[time] else ""
+def each(line: Line, time: str) -> str:
+    return number(str(1e3 * float(line[time]) / int(line["batch"]))) if line[time] else ""
 
 
-def _ratio(theirs: Line, ours: Line, time: str) -> str:
-    return _number(str(float(theirs[time]) / float(ours[time]))) if theirs[time] and ours[time] else ""
+def ratio(theirs: Line, ours: Line, time: str) -> str:
+    return number(str(float(theirs[time]) / float(ours[time]))) if theirs[time] and ours[time] else ""
 
 
-def _table(header: list[str], rows: list[list[Any]], left: tuple[str, ...] = ()) -> list[str]:
+def table(header: list[str], rows: list[list[Any]], left: tuple[str, ...] = ()) -> list[str]:
     join: Callable[[list[Any]], str] = lambda cells: "| " + " | ".join(map(str, cells)) + " |"  # noqa: E731
     return [join(header), "|" + "|".join("---" if name in left else "---:" for name in header) + "|", *map(join, rows)]

@@ -1,8 +1,9 @@
 """Benchmark: time and error of torch_dpc beside other solvers and differentiable QP layers.
 
-    python scripts/benchmark.py             # about 30 minutes on two cores
+    python scripts/benchmark.py             # about 40 minutes on two cores
     python scripts/benchmark.py --quick     # under 2 minutes: the masses at horizon 25, the fastest peers
     python scripts/benchmark.py --scaling   # the number of recorded windows, 500 to 50,000, alone
+    python scripts/benchmark.py --docs      # everything, then Table I and the profile, all into docs/benchmarks.md
 
 Both plants of the paper, horizons 25 to 100, batches 1 to 1024; every peer in `baselines/` on the QP as the paper
 prints it and on our reduced form. Each row is measured in a process of its own, so a peer that crashes, hangs or eats
@@ -39,12 +40,14 @@ sys.path.insert(0, str(ROOT))  # baselines/ lies beside scripts/
 from tqdm import tqdm  # noqa: E402
 
 from _bench_cases import LOOP, OURS, SEED, Row, full_rows, quick_rows, scaling_rows, write_case  # noqa: E402
+from _bench_docs import refresh  # noqa: E402
 from _bench_report import write_report  # noqa: E402
 from _bench_row import MARK, measure  # noqa: E402
 from _common import RESULTS, cores  # noqa: E402
 
 TIME_LIMIT = {"full": 60.0, "quick": 20.0}  # [s] a row, imports included
 
+SOURCES = (".py", ".c", ".h")
 KEYS = ("name", "plant", "horizon", "n_g", "batch", "scaling")
 TIMES = [f"{stage}_{part}" for stage in ("forward", "both", "backward") for part in ("ms", "q1", "q3")]
 MEASURED = ["status", "setup_ms", "first_ms", *TIMES, "repeats", "ratio", "peak_mb", "kkt_size"]
@@ -170,7 +173,7 @@ def _stamp(row: Row, mode: str, threads: int) -> Line:
     """Return what a row is made with: the packages, and the sources that its numbers depend on."""
     folders = {"ours": ["torch_dpc"], "loop": [], "peers": ["baselines"]}
     made_of = folders["ours" if row.name in OURS else "loop" if row.name == LOOP else "peers"]
-    files = [path for folder in made_of for path in sorted((ROOT / folder).rglob("*.py"))]
+    files = [path for folder in made_of for path in sorted((ROOT / folder).rglob("*")) if path.suffix in SOURCES]
     files += [
         ROOT / "scripts" / name
         for name in ("_bench_row.py", "_bench_timing.py", "_bench_cases.py", "_daqp_loop.py", "_reference.py")
@@ -217,6 +220,7 @@ def main(argv: list[str] | None = None) -> None:
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
     parser.add_argument("--quick", action="store_true", help="the masses at horizon 25 and the fastest peers alone")
     parser.add_argument("--scaling", action="store_true", help="only the rows that let n_g grow")
+    parser.add_argument("--docs", action="store_true", help="refresh every table and picture of docs/benchmarks.md")
     parser.add_argument("--only", default="", help="only the rows whose name contains this")
     parser.add_argument("--fresh", action="store_true", help="forget what was measured before")
     parser.add_argument("--threads", type=int, default=cores(), help="of every solver (default: one a core)")
@@ -233,7 +237,13 @@ def main(argv: list[str] | None = None) -> None:
     rows = scaling_rows() if args.scaling else quick_rows() if args.quick else full_rows(PEERS)
     mode = "quick" if args.quick else "full"
     run((row for row in rows if args.only in row.name), args.out, mode, args.threads, args.fresh)
-    print(write_report(args.out, read_lines(args.out / "benchmark.csv")))
+    lines = read_lines(args.out / "benchmark.csv")
+    print(write_report(args.out, lines))
+    if args.docs:
+        for script, threads in (("table1_sizes.py", []), ("profile_layer.py", ["--threads", str(args.threads)])):
+            command = [sys.executable, str(ROOT / "scripts" / script), "--out", str(args.out), *threads]
+            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        refresh(ROOT / "docs" / "benchmarks.md", args.out, lines)
 
 
 if __name__ == "__main__":

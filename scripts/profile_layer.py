@@ -25,8 +25,8 @@ from torch import Tensor
 import torch_dpc as dpc
 from _bench_cases import CYCLE, N_G, T_INI, inputs_of, layer_of, record, take
 from _common import RESULTS, cores, versions
+from torch_dpc import kernels
 from torch_dpc.active_set import adjoint
-from torch_dpc.dual_active_set import sense_of
 from torch_dpc.newton import solve_newton
 
 PLANT, HORIZON, BATCHES = "masses", 25, (1, 1024)
@@ -74,14 +74,14 @@ def stages_of(layer: dpc.DPCLayer, problems: list[Problem]) -> tuple[Stages, Sta
     reduction, (lower, upper) = solver.reduction, layer.bounds(device)
     thetas = [_theta(layer, problem) for problem in problems]
     solved = [solver.solve(theta, lower, upper) for theta in thetas]
-    one = thetas[0].ndim == 1  # one problem: NumPy and DAQP; many: torch and Newton
+    one = thetas[0].ndim == 1  # one problem: NumPy around the kernel; many: torch
     engine, as_array = (solver._single, Tensor.numpy) if one else (solver._batched, lambda tensor: tensor)
     samples, lo, up = [as_array(theta) for theta in thetas], as_array(lower), as_array(upper)
     starts, lams = [engine.unconstrained(sample) for sample in samples], [as_array(found.lam) for found in solved]
 
     def find(start: Any) -> Any:
         if one:
-            return solver._daqp.solve(lo - start[1], up - start[1], sense_of(lo == up))
+            return kernels.solve_boxes(solver.arrays[2], start[1][None], lo, up)
         return solve_newton(reduction.G, reduction.Ct, start[1], lower, upper)
 
     bars, N = [torch.ones_like(found.lam) for found in solved], len(lower)
@@ -94,7 +94,7 @@ def stages_of(layer: dpc.DPCLayer, problems: list[Problem]) -> tuple[Stages, Sta
     }
     inside = {
         "unconstrained minimiser": lambda i: engine.unconstrained(samples[i % n]),
-        "DAQP" if one else "Newton": lambda i: find(starts[i % n]),
+        "finding the active set": lambda i: find(starts[i % n]),
         "judging the solution": lambda i: engine.judge(samples[i % n], *starts[i % n], lams[i % n], lo, up),
     }
     backward = {
@@ -167,6 +167,8 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder for the results (default results/)")
     args = parser.parse_args(argv)
     torch.set_num_threads(args.threads)
+    if not kernels.serve(torch.ones(())):
+        raise SystemExit("The kernels were not built, so there is nothing to profile: install with a C compiler.")
     recording = record(PLANT, N_G + T_INI + HORIZON - 1)
     layer = layer_of(PLANT, *recording, HORIZON)
     inputs = inputs_of(PLANT, layer, *recording)

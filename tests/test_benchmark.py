@@ -17,6 +17,7 @@ sys.path.insert(0, str(SCRIPTS))
 
 import benchmark  # noqa: E402
 from _bench_cases import LOOP, Row, full_rows, inputs_of, layer_of, quick_rows, read_case, record, take  # noqa: E402
+from _bench_docs import refresh  # noqa: E402
 from _bench_report import write_report  # noqa: E402
 from _reference import HigherPrecision, eliminate, relative  # noqa: E402
 from baselines import PEERS  # noqa: E402
@@ -176,19 +177,12 @@ def test_a_case_comes_back_as_it_was_written(tmp_path):
 # --- the report ------------------------------------------------------------------------------------------------------
 
 
-def test_the_report_gives_ratios_to_the_fastest_peer_and_to_the_loop(tmp_path):
-    def line(name, **values):
-        told = {
-            "name": name,
-            "plant": "masses",
-            "horizon": 25,
-            "n_g": 500,
-            "batch": 1,
-            "scaling": False,
-            "status": "ok",
-        }
-        return benchmark._strings({**told, "seed": 0, "threads": 2, "mode": "full", **values})
+def line(name, **values):
+    told = {"name": name, "plant": "masses", "horizon": 25, "n_g": 500, "batch": 1, "scaling": False, "status": "ok"}
+    return benchmark._strings({**told, "seed": 0, "threads": 2, "mode": "full", **values})
 
+
+def test_the_report_gives_ratios_to_the_fastest_peer_and_to_the_loop(tmp_path):
     lines = [
         line("torch_dpc", forward_ms=0.1, both_ms=0.2, gradient_error=1e-10),
         line(LOOP, forward_ms=0.05),
@@ -205,3 +199,29 @@ def test_the_report_gives_ratios_to_the_fastest_peer_and_to_the_loop(tmp_path):
     text = (tmp_path / "benchmark.md").read_text()
     assert "failed: P is not SPD" in text and "a / b" in text
     assert (tmp_path / "benchmark.png").stat().st_size > 10_000
+
+
+def test_the_page_takes_every_measured_part_and_keeps_the_rest(tmp_path):
+    page = tmp_path / "docs" / "benchmarks.md"
+    (page.parent / "images").mkdir(parents=True)
+    page.write_text((SCRIPTS.parent / "docs" / "benchmarks.md").read_text())
+    (tmp_path / "benchmark.png").write_bytes(b"a picture")
+    (tmp_path / "table1_sizes.md").write_text("# Table I\n\n| CVXPYlayers | 1799 |\n")
+    (tmp_path / "profile.md").write_text("# Profile\n\nmade with\n\n## Batch 1\n\n| DAQP | 1.0 |\n")
+    peer = line("QPLayer (reduced)", forward_ms=1.0, both_ms=1.7, gradient_error=1e-6)
+    late = line(
+        "cvxpylayers DIFFCP SCS dense (paper)", status="time limit", message="stopped after 60 s", forward_ms=9000.0
+    )
+    lines = [line("torch_dpc", forward_ms=0.1, both_ms=0.2), line(LOOP, forward_ms=0.05), peer, late]
+    lines.append(line("torch_dpc", n_g=5000, scaling=True, setup_ms=100.0, forward_ms=0.1, ratio=1.01))
+    for _ in range(2):  # and again, over its own words
+        refresh(page, tmp_path, lines)
+    text = page.read_text()
+    for part in ("| CVXPYlayers | 1799 |", "### Batch 1", "| 5000 | 0.1 |", "time limit: stopped after 60 s"):
+        assert text.count(part) >= 1, part
+    assert "at batch 1 the best differentiable peer, QPLayer (reduced), takes 8.5 times as long" in text
+    assert text.count("1799 term by term") == 1 and text.count("<!-- end -->") == 6
+    assert (page.parent / "images" / "benchmark.png").read_bytes() == b"a picture"
+    page.write_text(text.replace("measured: scaling", "measured: nothing"))
+    with pytest.raises(ValueError, match="must mark .*scaling"):
+        refresh(page, tmp_path, lines)

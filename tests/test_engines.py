@@ -24,7 +24,8 @@ from helpers import (
 )
 
 ENGINES = ["auto", "newton", "daqp"]
-SAME = 1e-10  # engines end in one common polish or exact multipliers
+SAME = 1e-10  # engines end in exact multipliers
+ROUNDING = 1e-15  # of v = v0 - G lam, |G| = 1, a unit of lam: samples that almost have no solution push with 1e6
 PLAN = 1e-9
 
 PROBLEMS = {
@@ -64,10 +65,11 @@ def test_engines_agree_on_the_papers_problem(noise):
     ]
     solved = sols[0].info.status == dpc.Status.SOLVED
     assert solved.sum() > 100
+    same = SAME + ROUNDING * float(sols[0].lam[solved].abs().max())
     for sol in sols[1:]:
         assert torch.equal(sol.info.status, sols[0].info.status)
-        assert relative(sol.u[solved], sols[0].u[solved]) < SAME
-        assert relative(sol.y[solved], sols[0].y[solved]) < SAME
+        assert relative(sol.u[solved], sols[0].u[solved]) < same
+        assert relative(sol.y[solved], sols[0].y[solved]) < same
 
 
 def test_where_newton_cycles_the_answer_is_still_right():

@@ -4,7 +4,7 @@ import pytest
 import torch
 
 import torch_dpc as dpc
-from helpers import PAPER, Y_REF, masses_data, windows
+from helpers import PAPER, SMALL, Y_REF, masses_data, windows
 from torch_dpc.soften import plan_softened
 
 EXACT = 1e-6  # of the price, which is found by sections
@@ -71,3 +71,21 @@ def test_softening_cannot_mend_an_input_the_data_cannot_produce():
     theta, _ = layer.flatten(torch.ones(2, 2, dtype=torch.float64), torch.zeros(2, 2, dtype=torch.float64), None, None)
     with pytest.raises(dpc.SolveError, match="does not help"):
         plan_softened(layer, theta, 1e3)
+
+
+def test_limits_on_changes_of_the_input_are_not_widened():
+    layer = dpc.DPCLayer(
+        masses_data(1e-2), **SMALL, u_set=dpc.Box(-1.0, 1.0), y_set=dpc.Box(-0.05, 0.05), du_set=dpc.Box(-0.1, 0.1)
+    )
+    u_ini, y_ini = (w[0] for w in windows(1, seed=3))
+    u_ini = 0.0 * u_ini
+    theta, _ = layer.flatten(u_ini, y_ini, None, None)
+    plan, width = plan_softened(layer, theta, 10.0)
+    changes = torch.cat([u_ini[-1:], plan.u]).diff(dim=0)
+    assert width > 0.05 and float(changes.abs().max()) <= 0.1 + 1e-9
+
+
+def test_sets_that_are_no_boxes_have_their_own_softening():
+    layer = dpc.DPCLayer(masses_data(1e-2), **SMALL, y_set=dpc.Ball(1.0))
+    with pytest.raises(ValueError, match="give the layer a SoftBox"):
+        dpc.DPCController(layer, on_failure="soften")

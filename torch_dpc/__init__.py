@@ -4,15 +4,19 @@ from . import attacks, systems
 from .controller import DPCController
 from .errors import ExcitationWarning, InfeasibleError, SolveError, Status
 from .hankel import HankelData, excitation_order, hankel
+from .hankel_batch import HankelBatch
 from .layer import DPCLayer
 from .problem import CompactForm
-from .sets import Box, ConvexSet, Reals
+from .saving import register_set
+from .sets import Ball, Box, ConvexSet, NonNegative, Product, Reals, SecondOrderCone, SoftBox
 from .simulation import ClosedLoopLog, Plant, collect, simulate
 from .solution import DPCSolution, SolveInfo
+from .stream import HankelStream
 
 __version__ = "0.1.0"
 
 __all__ = [
+    "Ball",
     "Box",
     "ClosedLoopLog",
     "CompactForm",
@@ -21,10 +25,16 @@ __all__ = [
     "DPCLayer",
     "DPCSolution",
     "ExcitationWarning",
+    "HankelBatch",
     "HankelData",
+    "HankelStream",
     "InfeasibleError",
+    "NonNegative",
     "Plant",
+    "Product",
     "Reals",
+    "SecondOrderCone",
+    "SoftBox",
     "SolveError",
     "SolveInfo",
     "Status",
@@ -32,6 +42,7 @@ __all__ = [
     "collect",
     "excitation_order",
     "hankel",
+    "register_set",
     "simulate",
     "systems",
 ]

@@ -1,29 +1,22 @@
 """Small symmetric systems on the active rows, one set of rows a sample.
 
 A sample with active rows A needs  lam_A = G[A, A]^-1 rhs_A,  lam = 0 elsewhere: Newton's step in the forward solve,
-the adjoint in the backward one. The rows of a group of samples are packed to the longest list and the missing ones
-read an identity, so that one batched Cholesky serves; samples whose active rows are (nearly) dependent go through a
-QR of the rows of Ct, because G = Ct Ct' squares their condition.
+the adjoint in the backward one. On the CPU the compiled kernels take the samples; elsewhere their rows are packed to
+the longest list and the missing ones read an identity, so that one batched Cholesky serves. Samples whose active rows
+are (nearly) dependent go through a QR of the rows of Ct, because G = Ct Ct' squares their condition.
 """
 
 from __future__ import annotations
 
-import numpy as np
 import torch
-from scipy.linalg.lapack import dposv
 from torch import Tensor
 
+from . import kernels
+from .kernels import STANDING_OUT
 from .linear import times
 
-#: A Cholesky factor of G[A, A] is trusted where every row of Ct stands out of the span of those before it by this
-#: fraction of its length; G cannot tell less.
-STANDING_OUT = 1e-5
 #: Rows of Ct that stand out of the span of the others by less than this fraction of their length are dependent.
 DEPENDENT_ROW = 1e-9
-#: Samples of like size that share one padded factorisation on the CPU.
-GROUP = 128
-#: Up to this many samples NumPy, one after the other, beats the packing.
-FEW = 4
 
 
 def solve_active(G: Tensor, Ct: Tensor, active: Tensor, rhs: Tensor) -> tuple[Tensor, Tensor]:
@@ -38,9 +31,8 @@ def solve_active(G: Tensor, Ct: Tensor, active: Tensor, rhs: Tensor) -> tuple[Te
         lam `(B, N)`, zero outside A, and whether the rows A were independent, `(B,)`. Where they were not, dependent
         rows are left out (lam = 0).
     """
-    on_cpu = rhs.device.type == "cpu"
-    lam, trusted = (_one_by_one if on_cpu and len(rhs) <= FEW else _packed)(G, active, rhs)
-    for i in _where_not(trusted):
+    lam, trusted = (kernels.solve_active if kernels.serve(rhs) else _packed)(G, active, rhs)
+    for i in [] if bool(trusted.all()) else (~trusted).nonzero()[:, 0].tolist():
         chosen = active[i].nonzero()[:, 0]
         rows, R = _independent_rows(Ct if Ct.ndim == 2 else Ct[i], chosen)
         lam[i] = 0.0
@@ -51,11 +43,10 @@ def solve_active(G: Tensor, Ct: Tensor, active: Tensor, rhs: Tensor) -> tuple[Te
 
 def adjoint(G: Tensor, Ct: Tensor, active: Tensor, v_bar: Tensor, lam_bar: Tensor | None) -> Tensor:
     """Return v0_bar = v_bar + s, s_A = G_AA^-1 (lam_bar - G v_bar)_A; the arguments are those of `solve_active`."""
-    if v_bar.device.type == "cpu" and len(v_bar) <= FEW and G.ndim == 2:
-        out = v_bar.clone()
-        few = _adjoint_few(G.numpy(), active.numpy(), out.numpy(), None if lam_bar is None else lam_bar.numpy())
-        if few:
-            return out
+    if kernels.serve(v_bar):
+        v0_bar, trusted = kernels.adjoint(G, active, v_bar, lam_bar)
+        if bool(trusted.all()):
+            return v0_bar
     rhs = -times(G, v_bar)
     return v_bar + solve_active(G, Ct, active, rhs if lam_bar is None else rhs + lam_bar)[0]
 
@@ -70,69 +61,14 @@ def adjoint_dense(G: Tensor, active: Tensor, v_bar: Tensor, lam_bar: Tensor | No
     return v_bar + torch.cholesky_solve(rhs[..., None], torch.linalg.cholesky(matrix))[..., 0]
 
 
-def _adjoint_few(G: np.ndarray, active: np.ndarray, bar: np.ndarray, lam_bar: np.ndarray | None) -> bool:
-    """Turn v_bar into v0_bar in place; False where a system cannot be trusted."""
-    for i, v_bar in enumerate(bar):
-        rows = active[i].nonzero()[0]
-        rhs = -(G[rows] @ v_bar)
-        s = solve_rows(G, rows, rhs if lam_bar is None else rhs + lam_bar[i, rows])
-        if s is None:
-            return False
-        v_bar[rows] += s
-    return True
-
-
-def _where_not(flags: Tensor) -> list[int]:
-    return [] if bool(flags.all()) else (~flags).nonzero()[:, 0].tolist()
-
-
-def _one_by_one(G: Tensor, active: Tensor, rhs: Tensor) -> tuple[Tensor, Tensor]:
-    lam, trusted = torch.zeros_like(rhs), torch.ones(len(rhs), dtype=torch.bool)
-    matrices, rows_of, right, out = G.numpy(), active.numpy(), rhs.numpy(), lam.numpy()
-    for i in range(len(rhs)):
-        rows = rows_of[i].nonzero()[0]
-        solved = solve_rows(matrices if G.ndim == 2 else matrices[i], rows, right[i, rows])
-        if solved is None:
-            trusted[i] = False
-        else:
-            out[i, rows] = solved
-    return lam, trusted
-
-
-def solve_rows(G: np.ndarray, rows: np.ndarray, rhs: np.ndarray) -> np.ndarray | None:
-    """Return G[rows, rows]^-1 rhs, or None where Cholesky says that G cannot be trusted with it."""
-    if len(rows) == 0:
-        return rhs
-    # LAPACK itself: the wrappers of NumPy and torch cost several times a system of this size.
-    block = G[rows[:, None], rows]
-    factor, solution, failed = dposv(block, rhs)
-    if failed or not (factor.diagonal() > STANDING_OUT * block.diagonal() ** 0.5).all():
-        return None
-    return solution
-
-
 def _packed(G: Tensor, active: Tensor, rhs: Tensor) -> tuple[Tensor, Tensor]:
-    count = active.sum(dim=1)
-    table = _identity_padded(G)
-    if rhs.device.type != "cpu" or len(rhs) <= GROUP:
-        samples = torch.arange(len(rhs), device=rhs.device) if G.ndim == 3 else None
-        return _packed_group(table, active, rhs, count, samples)
-    # Samples of like size together: padding all to the largest would cost several times the flops.
-    lam, trusted = torch.zeros_like(rhs), torch.ones(len(rhs), dtype=torch.bool)
-    for part in count.argsort().split(GROUP):
-        lam[part], trusted[part] = _packed_group(table, active[part], rhs[part], count[part], part)
-    return lam, trusted
-
-
-def _packed_group(
-    table: Tensor, active: Tensor, rhs: Tensor, count: Tensor, samples: Tensor | None
-) -> tuple[Tensor, Tensor]:
+    """Solve all samples by one batched Cholesky, padded to the longest list."""
     n = rhs.shape[1]
-    index = _pack(active, count)
-    block = _blocks(table, index, samples)
+    index = _pack(active, active.sum(dim=1))
+    block = _blocks(_identity_padded(G), index)
     L, info = torch.linalg.cholesky_ex(block)
     x = torch.cholesky_solve(rhs.gather(1, index.clamp_max(n - 1))[..., None], L)[..., 0]
-    lam = x.new_zeros(len(rhs), 2 * n).scatter_(1, index, x)[:, :n]
+    lam = torch.zeros_like(rhs).masked_scatter(active, x[index < n])
     if L.shape[-1] == 0:
         return lam, info == 0
     # What of a row stands out of the span of those before it, as a fraction of its length: free of units.
@@ -160,12 +96,12 @@ def _pack(active: Tensor, count: Tensor) -> Tensor:
     return index
 
 
-def _blocks(table: Tensor, index: Tensor, samples: Tensor | None) -> Tensor:
+def _blocks(table: Tensor, index: Tensor) -> Tensor:
     """Return G[A, A] of each sample, `(b, k, k)`."""
     width = table.shape[-1]
     flat = index[:, :, None] * width + index[:, None, :]
-    if table.ndim == 3 and samples is not None:
-        flat = flat + samples[:, None, None] * width * width
+    if table.ndim == 3:
+        flat = flat + width * width * torch.arange(len(index), device=index.device)[:, None, None]
     return table.reshape(-1).index_select(0, flat.reshape(-1)).reshape(flat.shape)
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -40,7 +41,8 @@ def as_data(name: str, value: Any, *, finite: bool = True) -> Tensor:
 
 def is_finite(tensor: Tensor) -> bool:
     """Return whether every value is finite."""
-    return bool(torch.isfinite(tensor.detach()).all())
+    # A sum takes a tenth of the time; where it is finite, so is every value.
+    return math.isfinite(float(tensor.detach().sum())) or bool(torch.isfinite(tensor.detach()).all())
 
 
 def check_count(name: str, value: Any) -> None:

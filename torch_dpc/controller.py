@@ -56,6 +56,8 @@ class DPCController:
             )
         if on_failure not in ("raise", "hold", "soften"):
             raise ValueError(f'`on_failure` must be "raise", "hold" or "soften", got {on_failure!r}.')
+        if on_failure == "soften" and not layer.feasible_set.is_box:
+            raise ValueError('`on_failure="soften"` widens boxes; give the layer a SoftBox as `y_set` instead.')
         if not soft_weight > 0:
             raise ValueError(f"`soft_weight` must be positive, got {soft_weight!r}.")
         self.layer = layer

@@ -17,7 +17,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from .active_set import solve_active, solve_rows
+from .active_set import solve_active
 from .newton import ActiveSetResult
 
 #: DAQP's default, 1e-6, calls slightly infeasible problems solved.
@@ -80,29 +80,15 @@ def solve_daqp(
         G, Ct, v0, lower, upper: as there.
         workspace: the one of a shared Ct; made anew for each call and sample by default.
     """
-    lam = np.zeros(v0.shape)
+    lower, upper = lower.expand_as(v0), upper.expand_as(v0)
+    found, tight = np.zeros(v0.shape), (lower == upper).cpu().numpy()
     iterations, solved = np.zeros(len(v0), dtype=np.int64), np.zeros(len(v0), dtype=bool)
-    centres, lowers, uppers = (x.detach().cpu().numpy() for x in (v0, lower, upper))
-    grams = G.detach().cpu().numpy()
-    for i, centre in enumerate(centres):
-        lo, hi = (lowers, uppers) if lower.ndim == 1 else (lowers[i], uppers[i])
-        tight = lo == hi
+    below, above = ((bound - v0).detach().cpu().numpy() for bound in (lower, upper))
+    for i in range(len(v0)):
         daqp_of_sample = workspace or Daqp(Ct if Ct.ndim == 2 else Ct[i])
-        found, flag, iterations[i] = daqp_of_sample.solve(lo - centre, hi - centre, sense_of(tight))
+        found[i], flag, iterations[i] = daqp_of_sample.solve(below[i], above[i], sense_of(tight[i]))
         solved[i] = flag == SOLVED_FLAG
-        rows = np.flatnonzero((found != 0) | tight)
-        rhs = (centre - np.where(found > 0, hi, lo))[rows]
-        exact = solve_rows(grams if G.ndim == 2 else grams[i], rows, rhs)
-        if exact is None:
-            exact = _by_qr(G if G.ndim == 2 else G[i], Ct if Ct.ndim == 2 else Ct[i], rows, rhs)
-        lam[i, rows] = exact
-    device = v0.device
-    return ActiveSetResult(*(torch.from_numpy(x).to(device) for x in (lam, iterations, solved)))
-
-
-def _by_qr(G: Tensor, Ct: Tensor, rows: np.ndarray, rhs: np.ndarray) -> np.ndarray:
-    """Return the multipliers of nearly dependent rows."""
-    active = torch.zeros(1, len(G), dtype=torch.bool, device=G.device)
-    right = G.new_zeros(1, len(G))
-    active[0, rows], right[0, rows] = True, torch.from_numpy(rhs).to(G.device)
-    return solve_active(G, Ct, active, right)[0][0].cpu().numpy()[rows]
+    rough, *rest = (torch.from_numpy(x).to(v0.device) for x in (found, iterations, solved))
+    active = (rough != 0) | (lower == upper)
+    lam, _ = solve_active(G, Ct, active, v0 - torch.where(rough > 0, upper, lower))
+    return ActiveSetResult(lam, *rest)

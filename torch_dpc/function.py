@@ -18,36 +18,42 @@ from __future__ import annotations
 import inspect
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
+from . import kernels
 from .active_set import adjoint, adjoint_dense, solve_active
 from .errors import Status
 from .linear import flatten_batch, lead_all, outer, times
 from .projected_kkt import FullAdjoint
 from .reduction import Reduction
 from .solve import Planned, Solver
-from .transforms import carries_derivative, is_grads_batched, is_plain
+from .transforms import apply_function, carries_derivative, is_grads_batched, is_plain
 
 
 def solve_reduced(solver: Solver, theta: Tensor, reduction: Reduction, lower: Tensor, upper: Tensor) -> Planned:
     """Solve for every theta `(*batch, n_theta)`; differentiable in theta, the reduction and the bounds."""
-    inputs = (theta, reduction.A_theta, reduction.rows.C, reduction.G, reduction.Ct, lower, upper)
-    if not carries_derivative(inputs) and is_plain(theta):  # a third of the time of a small call is the Function's
-        return solver.solve(theta, lower, upper)
-    return Planned(*SolveReduced.apply(*inputs, solver))
+    matrices: tuple[Tensor | None, ...] = (reduction.A_theta, reduction.rows.C, reduction.G)
+    if not carries_derivative(matrices):
+        if not carries_derivative((theta, lower, upper)) and is_plain(theta):
+            return solver.solve(theta, lower, upper)  # a third of the time of a small call is the Function's
+        matrices = (None, None, None)  # constants: those of the solver will do, and need not be saved
+    return Planned(*apply_function(SolveReduced, theta, *matrices, lower, upper, solver))
 
 
 class SolveReduced(torch.autograd.Function):
-    """(theta, A, C, G, Ct, lower, upper) -> u, y, lam, active, info, as `Planned` describes them."""
+    """(theta, A, C, G, lower, upper) -> u, y, lam, active, info, as `Planned` describes them.
+
+    A, C and G are None where no derivative is asked of them; their values are always those of the solver.
+    """
 
     @staticmethod
     def forward(
         theta: Tensor,
-        A: Tensor,
-        C: Tensor,
-        G: Tensor,
-        Ct: Tensor,
+        A: Tensor | None,
+        C: Tensor | None,
+        G: Tensor | None,
         lower: Tensor,
         upper: Tensor,
         solver: Solver,
@@ -56,13 +62,14 @@ class SolveReduced(torch.autograd.Function):
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, ...]) -> None:
-        theta, A, C, G, Ct, lower, upper, solver = inputs
+        theta, A, C, G, lower, upper, solver = inputs
         _, _, lam, active, info = output
         ctx.mark_non_differentiable(active, info)
         ctx.set_materialize_grads(False)
-        ctx.full, ctx.sizes = solver.full, solver.sizes
+        ctx.solver = solver
         ctx.may_fail = solver.on_failure != "raise"
-        saved = (theta, A, C, G, Ct, lower, upper, lam, active, info)
+        ctx.bound_shapes = lower.shape, upper.shape
+        saved = (lam, active, info) if A is None else (lam, active, info, theta, A, C, G)
         ctx.save_for_backward(*saved)
         ctx.save_for_forward(*saved)
 
@@ -70,34 +77,40 @@ class SolveReduced(torch.autograd.Function):
     def backward(
         ctx: Any, u_bar: Tensor | None, y_bar: Tensor | None, lam_bar: Tensor | None, *_: Any
     ) -> tuple[Tensor | None, ...]:
-        theta, A, C, G, Ct, lower, upper, lam, active, info = ctx.saved_tensors
-        if u_bar is None and y_bar is None and lam_bar is None:
-            return (None,) * 8
-        v_bar = ctx.sizes.join(u_bar, y_bar, lam)
+        bars = [bar for bar in (u_bar, y_bar, lam_bar) if bar is not None]
+        if not bars:
+            return (None,) * 7
+        lam, active, info, *matrices = ctx.saved_tensors
+        solver, need = ctx.solver, ctx.needs_input_grad
+        at_last = not torch.is_grad_enabled() and all(map(is_plain, bars))  # nothing will be derived again
+        if at_last and lam.ndim == 1 and not (ctx.may_fail or any(need[1:])):
+            theta_bar = _of_one(solver, active, u_bar, y_bar, lam_bar)
+            if theta_bar is not None:
+                return theta_bar, *(None,) * 6
+        v_bar = solver.sizes.join(u_bar, y_bar, lam)
         if ctx.may_fail:  # samples without a solution add nothing, whatever came back for their NaN
             solved = info[..., :1] == Status.SOLVED
             v_bar = torch.where(solved, v_bar, 0.0)
             lam_bar = None if lam_bar is None else torch.where(solved, lam_bar, 0.0)
-        if ctx.full is not None:
-            return FullAdjoint.apply(v_bar, lam_bar, active, ctx.full), *(None,) * 7
+        if solver.full is not None:
+            return FullAdjoint.apply(v_bar, lam_bar, active, solver.full), *(None,) * 6
+        theta, A, C, G = matrices or _constants(solver)
         if is_grads_batched(v_bar):
             v0_bar = adjoint_dense(G, active, v_bar, lam_bar)
-        elif not torch.is_grad_enabled() and is_plain(v_bar):  # nothing will be derived again: spare the Function
-            v0_bar = SolveAdjoint.forward(v_bar, lam_bar, active, G, Ct)
-        else:
-            v0_bar = SolveAdjoint.apply(v_bar, lam_bar, active, G, Ct)
-        need = ctx.needs_input_grad
+        else:  # the Function only where something will be derived again
+            adjoin = SolveAdjoint.forward if at_last else SolveAdjoint.apply
+            v0_bar = adjoin(v_bar, lam_bar, active, G, solver.reduction.Ct)
         a_bar = times(C.mT, v0_bar)
         theta_bar = times(A.mT, a_bar) if need[0] else None
         A_bar = outer(a_bar, theta, A) if need[1] else None
         C_bar = outer(v0_bar, times(A, theta), C) if need[2] else None
         G_bar = outer(-v0_bar, lam, G) if need[3] else None
         lower_bar = upper_bar = None
-        if need[5] or need[6]:
+        if need[4] or need[5]:
             b_bar = torch.where(active, v_bar - v0_bar, 0.0)
-            lower_bar = torch.where(lam < 0, b_bar, 0.0).sum_to_size(lower.shape)
-            upper_bar = torch.where(lam < 0, 0.0, b_bar).sum_to_size(upper.shape)
-        return theta_bar, A_bar, C_bar, G_bar, None, lower_bar, upper_bar, None
+            lower_bar = torch.where(lam < 0, b_bar, 0.0).sum_to_size(ctx.bound_shapes[0])
+            upper_bar = torch.where(lam < 0, 0.0, b_bar).sum_to_size(ctx.bound_shapes[1])
+        return theta_bar, A_bar, C_bar, G_bar, lower_bar, upper_bar, None
 
     @staticmethod
     def jvp(
@@ -106,12 +119,12 @@ class SolveReduced(torch.autograd.Function):
         A_t: Tensor | None,
         C_t: Tensor | None,
         G_t: Tensor | None,
-        _Ct: Any,
         lower_t: Tensor | None,
         upper_t: Tensor | None,
         _solver: Any,
     ) -> tuple[Tensor | None, ...]:
-        theta, A, C, G, Ct, lower, upper, lam, active, info = ctx.saved_tensors
+        lam, active, info, *matrices = ctx.saved_tensors
+        theta, A, C, G = matrices or _constants(ctx.solver)
         solved = info[..., :1] == Status.SOLVED
         free = torch.zeros_like(lam)
         if theta_t is not None:
@@ -127,23 +140,44 @@ class SolveReduced(torch.autograd.Function):
             rhs = rhs - torch.where(lam < 0, lower_t, 0.0)
         if upper_t is not None:
             rhs = rhs - torch.where(lam < 0, 0.0, upper_t)
-        lam_t = SolveActive.apply(rhs * solved, active, G, Ct)
+        lam_t = SolveActive.apply(rhs * solved, active, G, ctx.solver.reduction.Ct)
         v_t = torch.where(solved, free - times(G, lam_t), 0.0)
-        return *ctx.sizes.split(v_t), lam_t, None, None
+        return *ctx.solver.sizes.split(v_t), lam_t, None, None
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        theta, A, C, G, Ct, lower, upper, solver = args
-        if any(dim is not None for dim in in_dims[1:5]):
+        theta, A, C, G, lower, upper, solver = args
+        if any(dim is not None for dim in in_dims[1:4]):
             raise NotImplementedError(
                 "vmap over weights or data is not supported: give the layer weights with a leading batch dimension, "
                 "which share one batched factorisation."
             )
         theta, lower, upper = lead_all(
-            (theta, lower, upper), (in_dims[0], in_dims[5], in_dims[6]), (1, 1, 1), info.batch_size
+            (theta, lower, upper), (in_dims[0], in_dims[4], in_dims[5]), (1, 1, 1), info.batch_size
         )
-        outputs = SolveReduced.apply(theta, A, C, G, Ct, lower, upper, solver)
+        outputs = SolveReduced.apply(theta, A, C, G, lower, upper, solver)
         return outputs, (0,) * len(outputs)
+
+
+def _constants(solver: Solver) -> tuple[Any, Tensor, Tensor, Tensor]:
+    """Return A, C and G where they are constants; theta, which their derivatives alone need, stays out."""
+    return None, solver.reduction.A_theta, solver.reduction.rows.C, solver.reduction.G
+
+
+def _of_one(
+    solver: Solver, active: Tensor, u_bar: Tensor | None, y_bar: Tensor | None, lam_bar: Tensor | None
+) -> Tensor | None:
+    """Return theta_bar of one sample by NumPy and the kernel; None where that does not do."""
+    if solver.full is not None or solver.reduction.G.ndim > 2 or not kernels.serve(active):
+        return None
+    v_bar, n_u = np.zeros(len(active)), solver.sizes.u
+    for bar, part in ((u_bar, v_bar[:n_u]), (y_bar, v_bar[n_u : n_u + solver.sizes.y])):
+        if bar is not None:
+            part[:] = bar.numpy().reshape(-1)
+    lam_array = None if lam_bar is None else kernels.as_array(lam_bar)
+    A, C, G = solver.arrays
+    v0_bar = kernels.adjoint_of_one(G, active.numpy(), v_bar, lam_array)
+    return None if v0_bar is None else torch.from_numpy((v0_bar @ C) @ A)
 
 
 class SolveAdjoint(torch.autograd.Function):

@@ -8,37 +8,20 @@ van Waarde, De Persis, Camlibel, Tesi 2020), so that no window runs across a sea
 
 from __future__ import annotations
 
-import warnings
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from .checks import as_data, check_count
-from .errors import ExcitationWarning
+from .checks import check_count
+from .excitation import excitation_order, has_full_row_rank, warn_of_excitation
+from .recordings import as_recordings, hankel
 from .rowspace import RowSpace, relative_tolerance
 
-
-def hankel(w: Tensor, depth: int) -> Tensor:
-    """Return the Hankel matrix of one signal.
-
-    Args:
-        w: the samples, shape `(T, n)`.
-        depth: how many steps one column holds; at most T.
-
-    Returns:
-        Shape `(depth n, T - depth + 1)`; column j stacks w[j], ..., w[j + depth - 1], time-major.
-
-    Example:
-        >>> hankel(torch.arange(4.0).reshape(4, 1), depth=2)
-        tensor([[0., 1., 2.],
-                [1., 2., 3.]])
-    """
-    windows = w.unfold(0, depth, 1)  # (T - depth + 1, n, depth)
-    return windows.permute(2, 1, 0).reshape(depth * w.shape[1], -1)
+__all__ = ["HankelData", "excitation_order", "hankel"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +33,16 @@ class HankelData:
         Yp, Yf: past and future outputs, `(t_ini n_y, n_g)` and `(horizon n_y, n_g)`.
         t_ini, horizon: past and future steps of a window.
         n_u, n_y: inputs and outputs of the system.
+        windows_seen: None where each column is a recorded window. Otherwise the data are compact, and this is how many
+            windows went into them (:meth:`from_stream`, :meth:`compressed`).
+        recorded_as: the precision of the recordings; None for that of the matrices. It sets the rank tolerance.
 
     The rows are time-major and each column is one window. The matrices are constants of the problem: replace
     the object rather than edit them. A graph behind the trajectories is kept, so the data can be differentiated.
+
+    Compact data hold the factor L of D = [Up; Yp; Uf; Yf] = L B' in place of D, with B (n_g, k) of orthonormal columns
+    and k at most the number of rows. The problem depends on D through D D' = L L' alone, so that plans, multipliers and
+    derivatives are those of the windows; only g is another, B'g.
 
     Example:
         >>> u, y = torch.rand(40, 1, dtype=torch.float64), torch.rand(40, 2, dtype=torch.float64)
@@ -69,6 +59,8 @@ class HankelData:
     horizon: int
     n_u: int
     n_y: int
+    windows_seen: int | None = None
+    recorded_as: torch.dtype | None = None
 
     @classmethod
     def from_trajectories(cls, u: Any, y: Any, *, t_ini: int, horizon: int) -> HankelData:
@@ -88,7 +80,7 @@ class HankelData:
         """
         check_count("t_ini", t_ini)
         check_count("horizon", horizon)
-        u_list, y_list = _recordings(u, y)
+        u_list, y_list = as_recordings(u, y)
         depth = t_ini + horizon
         for i, recording in enumerate(u_list):
             if recording.shape[0] < depth:
@@ -99,14 +91,97 @@ class HankelData:
         n_u, n_y = u_list[0].shape[1], y_list[0].shape[1]
         U = torch.cat([hankel(recording, depth) for recording in u_list], dim=1)
         Y = torch.cat([hankel(recording, depth) for recording in y_list], dim=1)
-        _check_excitation([recording.detach() for recording in u_list], U.detach(), depth)
+        if not has_full_row_rank(U.detach(), relative_tolerance(U.dtype)):
+            order = excitation_order([recording.detach() for recording in u_list])
+            warn_of_excitation(order, depth, U.shape[1], n_u, stacklevel=2)
         cut_u, cut_y = t_ini * n_u, t_ini * n_y
         return cls(U[:cut_u], U[cut_u:], Y[:cut_y], Y[cut_y:], t_ini, horizon, n_u, n_y)
 
+    @classmethod
+    def from_stream(cls, chunks: Iterable[Any], *, t_ini: int, horizon: int) -> HankelData:
+        """Build compact data from recordings of any length, piece by piece, in constant memory.
+
+        Each window is folded into a triangular factor (:class:`torch_dpc.HankelStream`) and forgotten. Plans are those
+        of :meth:`from_trajectories` on the same recordings; `sol.g` is not available, for the windows are gone. A graph
+        behind the samples is not kept.
+
+        Args:
+            chunks: pairs (u, y), `(T_i, n_u)` and `(T_i, n_y)`, tensors or arrays. Each goes on where the one before
+                ended; None between two of them starts a new recording, and no window runs across that seam.
+            t_ini: steps that fix the initial condition.
+            horizon: steps that are planned.
+
+        Raises:
+            ValueError: shapes that do not fit, samples that are not finite, or no recording as long as one window.
+
+        Warns:
+            ExcitationWarning: the input is not persistently exciting of order t_ini + horizon.
+
+        Example:
+            >>> def recorder():
+            ...     for seed in range(3):
+            ...         source = torch.Generator().manual_seed(seed)
+            ...         yield torch.rand(50, 1, generator=source), torch.rand(50, 2, generator=source)
+            >>> HankelData.from_stream(recorder(), t_ini=2, horizon=5).n_windows
+            144
+        """
+        from .stream import HankelStream  # it makes HankelData itself
+
+        stream = HankelStream(t_ini=t_ini, horizon=horizon)
+        stream.extend(chunks)
+        data = stream.data
+        if (order := stream.excitation_order) < t_ini + horizon:
+            warn_of_excitation(order, t_ini + horizon, data.n_windows, data.n_u, stacklevel=2)
+        return data
+
     @property
     def n_g(self) -> int:
-        """The number of windows: columns of the matrices."""
+        """The columns of the matrices: the number of windows, unless the data are compact."""
         return self.Up.shape[-1]
+
+    @property
+    def has_windows(self) -> bool:
+        """Whether each column is a recorded window; not so for compact data."""
+        return self.windows_seen is None
+
+    @property
+    def n_windows(self) -> int:
+        """The number of recorded windows that are in the data."""
+        return self.n_g if self.windows_seen is None else self.windows_seen
+
+    def require_windows(self) -> None:
+        """Raise ValueError where the data are compact, for `g` weighs the recorded windows."""
+        if not self.has_windows:
+            raise ValueError(
+                f"`g` weighs the recorded windows, and these data are compact: of {self.n_windows} windows only the "
+                f"factor is kept. u, y and lam do not need them; for g build the layer on "
+                f"HankelData.from_trajectories, or save it with `data=True`."
+            )
+
+    @property
+    def rank_tolerance(self) -> float:
+        """Singular values at or below this fraction of the largest count as zero."""
+        return relative_tolerance(self.recorded_as or self.Up.dtype)
+
+    def compressed(self) -> HankelData:
+        """Return the same data as `rank` columns, whatever the number of windows; plans are the same to the last bit.
+
+        The matrices are those of the data in an orthonormal basis of their row space, float64, with the rank as it was
+        decided here. A graph behind the matrices is kept, to first order.
+
+        Example:
+            >>> u, y = torch.rand(90, 1, dtype=torch.float64), torch.rand(90, 1, dtype=torch.float64)
+            >>> data = HankelData.from_trajectories(u, y, t_ini=2, horizon=5)
+            >>> data.n_g, data.compressed().n_g, data.compressed().n_windows
+            (84, 14, 84)
+        """
+        rows = self.stacked @ self.basis
+        Up, Yp, Uf, Yf = rows.split([len(m) for m in self.matrices])
+        compact = replace(
+            self, Up=Up, Uf=Uf, Yp=Yp, Yf=Yf, windows_seen=self.n_windows, recorded_as=self.recorded_as or self.Up.dtype
+        )
+        compact.__dict__["row_space"] = self.row_space.of_its_coordinates()
+        return compact
 
     @property
     def matrices(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
@@ -120,87 +195,30 @@ class HankelData:
             return RowSpace.of(self)
 
     @property
+    def device(self) -> torch.device:
+        """Where the data are."""
+        return self.Up.device
+
+    @property
+    def stacked(self) -> Tensor:
+        """The matrix [Up; Yp; Uf; Yf], float64; a graph is kept."""
+        return torch.cat([m.double() for m in self.matrices])
+
+    @property
+    def basis(self) -> Tensor:
+        """B of g = B a, `(n_g, rank)`."""
+        return self.row_space.basis
+
+    @property
     def rank(self) -> int:
         """The numerical rank of [Up; Yp; Uf; Yf], channels brought to one scale."""
         return self.row_space.rank
 
     def __repr__(self) -> str:
         space = self.row_space
+        compact = "" if self.has_windows else f" (compact, of {self.n_windows} windows)"
         return (
-            f"HankelData(n_u={self.n_u}, n_y={self.n_y}, t_ini={self.t_ini}, horizon={self.horizon}, n_g={self.n_g}, "
-            f"rank={space.rank} of {space.n_rows} rows, singular values {space.last_kept:.1e} kept / "
+            f"HankelData(n_u={self.n_u}, n_y={self.n_y}, t_ini={self.t_ini}, horizon={self.horizon}, n_g={self.n_g}"
+            f"{compact}, rank={space.rank} of {space.n_rows} rows, singular values {space.last_kept:.1e} kept / "
             f"{space.first_dropped:.1e} dropped, relative to the largest)"
         )
-
-
-def _recordings(u: Any, y: Any) -> tuple[list[Tensor], list[Tensor]]:
-    """Return the recordings as two lists of matching tensors `(T, n)`."""
-
-    def listed(name: str, value: Any) -> list[Tensor]:
-        many = isinstance(value, Sequence) and len(value) > 0 and all(getattr(v, "ndim", 0) == 2 for v in value)
-        if isinstance(value, Sequence) and not many and _depth(value) == 3:
-            many = True
-        items = [as_data(f"{name}[{i}]", v) for i, v in enumerate(value)] if many else [as_data(name, value)]
-        for item in items:
-            if item.ndim != 2 or item.shape[1] == 0:
-                raise ValueError(
-                    f"`{name}` must have shape (T, n), time first, or be a list of such, got {tuple(item.shape)}."
-                )
-        return items
-
-    u_list, y_list = listed("u", u), listed("y", y)
-    if len(u_list) != len(y_list):
-        raise ValueError(f"`u` and `y` must hold as many recordings, got {len(u_list)} and {len(y_list)}.")
-    for i, (a, b) in enumerate(zip(u_list, y_list, strict=True)):
-        if a.shape[0] != b.shape[0]:
-            raise ValueError(f"recording {i}: `u` and `y` must be as long, got {a.shape[0]} and {b.shape[0]} samples.")
-        if a.shape[1] != u_list[0].shape[1] or b.shape[1] != y_list[0].shape[1]:
-            raise ValueError(f"recording {i} has other channels than recording 0: {a.shape[1]} and {b.shape[1]}.")
-    common = torch.promote_types(u_list[0].dtype, y_list[0].dtype)
-    return [a.to(common) for a in u_list], [b.to(common) for b in y_list]
-
-
-def _depth(value: Any) -> int:
-    """Return how deep a nested list is."""
-    return 1 + _depth(value[0]) if isinstance(value, Sequence) and len(value) > 0 else 0
-
-
-def excitation_order(recordings: list[Tensor]) -> int:
-    """Return the largest depth whose (mosaic-)Hankel matrix of the inputs has full row rank.
-
-    Args:
-        recordings: inputs, each `(T, n_u)`.
-
-    Example:
-        >>> u = torch.tensor([0.0, 0.0, 1.0, 0.0, 0.0], dtype=torch.float64).reshape(5, 1)
-        >>> excitation_order([u]), excitation_order([torch.ones(9, 1)])
-        (3, 1)
-    """
-    low, high = 0, max(recording.shape[0] for recording in recordings)
-    while low < high:  # full row rank at depth L implies it at every smaller depth: bisect
-        middle = (low + high + 1) // 2
-        blocks = [hankel(w, middle) for w in recordings if w.shape[0] >= middle]
-        low, high = (middle, high) if _has_full_row_rank(torch.cat(blocks, dim=1)) else (low, middle - 1)
-    return low
-
-
-def _has_full_row_rank(matrix: Tensor) -> bool:
-    if matrix.shape[0] > matrix.shape[1]:
-        return False
-    R = torch.linalg.qr(matrix.double().T, mode="r").R
-    singular = torch.linalg.svdvals(R)
-    return bool(singular[-1] > relative_tolerance(matrix.dtype) * singular[0])
-
-
-def _check_excitation(recordings: list[Tensor], U: Tensor, depth: int) -> None:
-    if _has_full_row_rank(U):
-        return
-    n_u, windows = recordings[0].shape[1], U.shape[1]
-    warnings.warn(
-        f"the input is persistently exciting of order {excitation_order(recordings)}, {depth} (t_ini + horizon) is "
-        f"needed, and {depth} plus the order of the system for a guarantee: the data do not hold every trajectory "
-        f"of the system. There are {windows} windows for {depth * n_u} input rows; record longer, or vary each "
-        f"input more.",
-        ExcitationWarning,
-        stacklevel=3,
-    )

@@ -1,4 +1,4 @@
-"""A proof that a sample has no solution."""
+"""A proof that a sample has no solution: a direction that separates the trajectories from the sets."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ import torch
 from torch import Tensor
 
 from .dual_active_set import SOLVED_FLAG, Daqp
+from .linear import times
+from .sets.feasible import FeasibleSet
 
 #: Directions of Ct below this fraction of the largest are none.
 DEPENDENT = 1e-10
@@ -62,3 +64,34 @@ def _separates(d: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) 
     leak = norm(Ct.T @ d)
     # x with |x| > margin / leak are not excluded: demand that they be absurdly far away.
     return bool(margin > MARGIN * size) and bool(margin > FAR * (1 + size) * leak)
+
+
+#: Rounds that make a direction of a gap.
+ALTERNATIONS = 60
+
+
+def separates_from_set(Ct: Tensor, v0: Tensor, sets: FeasibleSet, gap: Tensor) -> Tensor:
+    """Return which samples, `(...)`, are proven to have no v = v0 + Ct x in the sets.
+
+    The shortest way from the sets to the trajectories, brought into the kernel of Ct' and to where the sets are
+    bounded, is a direction d; d'v0 > sup {d'v : v in the sets} is a proof, whoever found it.
+
+    Args:
+        Ct: `(N, n_x)`, or one a sample, in part order.
+        v0: `(..., N)`.
+        sets: all sets.
+        gap: a guess of that way, `(..., N)`; zero where there is none.
+    """
+    left, singular, _ = torch.linalg.svd(Ct, full_matrices=False)
+    span = left * (singular > DEPENDENT * singular.amax(-1, keepdim=True)).to(Ct)[..., None, :]
+    norm = torch.linalg.vector_norm
+    d = gap
+    for _ in range(ALTERNATIONS):
+        d = sets.bounded_direction(d - times(span, times(span.mT, d)))
+        d = d / norm(d, dim=-1, keepdim=True).clamp_min(torch.finfo(d.dtype).tiny)
+    most = sets.support(d)
+    margin = (d * v0).sum(-1) - most
+    size = norm(v0, dim=-1) + most.abs()
+    leak = norm(times(Ct.mT, d), dim=-1)
+    # x with |x| > margin / leak are not excluded: demand that they be absurdly far away.
+    return most.isfinite() & (margin > MARGIN * size) & (margin > FAR * (1 + size) * leak)

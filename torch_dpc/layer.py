@@ -2,23 +2,31 @@
 
 from __future__ import annotations
 
+import functools
+import os
 from typing import Any
 
 import torch
 from torch import Tensor, nn
 
 from .checks import reference, window, with_one_batch
+from .convex_solve import ConvexSolver
 from .errors import Status
 from .function import solve_reduced
 from .hankel import HankelData
+from .hankel_batch import HankelBatch
 from .linear import times
-from .problem import CompactForm, Sizes, compact_form, penalty, stacked_bounds, weight_matrix
+from .problem import CompactForm, Sizes, compact_form
 from .projected_kkt import FullSystem
-from .reduction import DataRows, Reduction, Weights, reduce
-from .sets import Box, Reals
+from .reduction import Reduction, reduce
+from .rows import DataRows, Terms
+from .saving import load_layer, save_layer
+from .sets import ConvexSet, Reals
+from .sets.feasible import FeasibleSet
 from .solution import DPCSolution, SolveInfo
-from .solve import Solver
+from .solve import Planned, Solver
 from .transforms import carries_derivative
+from .weights import Weights, penalty, weight_matrix
 
 
 class DPCLayer(nn.Module):
@@ -30,13 +38,25 @@ class DPCLayer(nn.Module):
     M = I - W^+ W, W = [Up; Yp; Uf] (Yu, Zhao, Chinchali, Topcu). The data are factored once, when they and the weights
     are first used; a call then costs a matrix product and small solves, whatever the number of recorded windows.
 
+    Beyond the paper, each exact in the reduction and differentiable:
+
+        regularizer="identity"   lambda_g |g|^2 in place of lambda_g |M g|^2
+        lambda_u                 lambda_u |Up g - u_ini|^2 in place of Up g = u_ini
+        R_du, du_set             + 1/2 |du|_R_du^2 and du in DU, du_t = u_t - u_(t-1), from the last of u_ini on
+        terminal_steps           the last outputs of the plan equal their reference
+
     Args:
         data: the recorded trajectories.
         Q: output weight, positive semidefinite: a number, `(n_y, n_y)`, or `(horizon n_y, horizon n_y)`.
         R: input weight, likewise.
         lambda_g: regularisation of the part of g that the past and the future input do not explain.
         lambda_s: penalty on the mismatch of the initial output.
-        u_set, y_set: constraints on every step's input and output; `None` for none.
+        u_set, y_set: constraints on every step's input and output, any :class:`ConvexSet`; `None` for none.
+        du_set: constraint on every step's change of the input.
+        R_du: weight of the changes of the input, given like R; `None` for none.
+        lambda_u: penalty on the mismatch of the initial input; `None` where that is to be exact.
+        regularizer: "projection", the paper's |M g|^2, or "identity", |g|^2.
+        terminal_steps: so many last outputs equal y_ref.
         backward: "reduced", the exact reduced system, or "full", the paper's projected KKT system.
         solver: the forward engine: "newton" (batched), "daqp" (one by one), or "auto".
         on_failure: "raise", or "nan" to mark samples that have no solution and return the others.
@@ -48,6 +68,7 @@ class DPCLayer(nn.Module):
         ValueError: bad input, named.
 
     Example:
+        >>> from torch_dpc import Box, HankelData
         >>> u = torch.rand(60, 1, dtype=torch.float64, generator=torch.Generator().manual_seed(0)) - 0.5
         >>> data = HankelData.from_trajectories(u, u.cumsum(0) - u, t_ini=2, horizon=5)   # an integrator
         >>> layer = DPCLayer(data, Q=1.0, R=0.1, lambda_g=1.0, lambda_s=1e3, u_set=Box(-0.3, 0.3))
@@ -58,14 +79,19 @@ class DPCLayer(nn.Module):
 
     def __init__(
         self,
-        data: HankelData,
+        data: HankelData | HankelBatch,
         Q: Any,
         R: Any,
         lambda_g: Any,
         lambda_s: Any,
-        u_set: Box | None = None,
-        y_set: Box | None = None,
+        u_set: ConvexSet | None = None,
+        y_set: ConvexSet | None = None,
         *,
+        du_set: ConvexSet | None = None,
+        R_du: Any = None,
+        lambda_u: Any = None,
+        regularizer: str = "projection",
+        terminal_steps: int = 0,
         backward: str = "reduced",
         solver: str = "auto",
         on_failure: str = "raise",
@@ -74,33 +100,65 @@ class DPCLayer(nn.Module):
         _check_choice("backward", backward, ("reduced", "full"))
         _check_choice("solver", solver, ("auto", "newton", "daqp"))
         _check_choice("on_failure", on_failure, ("raise", "nan"))
-        if not isinstance(data, HankelData):
-            raise ValueError(f"`data` must be a HankelData, got {type(data).__name__}.")
+        if not isinstance(data, (HankelData, HankelBatch)):
+            raise ValueError(f"`data` must be a HankelData or a HankelBatch, got {type(data).__name__}.")
+        _check_choice("regularizer", regularizer, ("projection", "identity"))
         self.data = data
         self.Q, self.R, self.lambda_g, self.lambda_s = Q, R, lambda_g, lambda_s
-        self.u_set, self.y_set = _as_box("u_set", u_set), _as_box("y_set", y_set)
+        self.lambda_u, self.R_du = lambda_u, R_du
+        self.u_set: ConvexSet = _as_set("u_set", Reals() if u_set is None else u_set)
+        self.y_set: ConvexSet = _as_set("y_set", Reals() if y_set is None else y_set)
+        self.du_set: ConvexSet | None = None if du_set is None else _as_set("du_set", du_set)
+        self.regularizer = regularizer
+        self.terminal_steps = _checked_steps(terminal_steps, data.horizon)
+        self.terms = Terms(
+            identity=regularizer == "identity",
+            slack=lambda_u is not None,
+            rates=R_du is not None or du_set is not None,
+            terminal_steps=self.terminal_steps,
+        )
+        if self.terms.slack and self.terms.rates:
+            raise ValueError("`R_du` and `du_set` count from the last u_ini, which `lambda_u` leaves open: give one.")
         self.backward_system = backward
         self.solver = solver
         self.on_failure = on_failure
-        self.sizes = Sizes.of(data)
+        self.sizes = Sizes.of(data, self.terms)
         self._cache: dict[tuple[str, torch.device], tuple[tuple[Any, ...], Any]] = {}
+        self._sets: tuple[tuple[Any, ...], FeasibleSet] | None = None
+        if not self.feasible_set.is_box and (backward == "full" or solver != "auto"):
+            raise ValueError('`backward="full"` and the choice of a `solver` are for sets that are boxes.')
         self._weights(torch.device("cpu"))  # bad weights and bounds are told now, not at the first call
-        stacked_bounds(self.u_set, self.y_set, data, torch.device("cpu"))
+        if self.feasible_set.is_box:
+            self.feasible_set.bounds(torch.device("cpu"))
 
     @property
     def reduction(self) -> Reduction:
         """The reduced problem of the present weights; see :mod:`torch_dpc.reduction`."""
-        return self._factors(self.data.Up.device)[0]
+        return self._factors(self.data.device)[0]
+
+    @property
+    def feasible_set(self) -> FeasibleSet:
+        """All sets of the problem as one."""
+        owners = (self.u_set, self.y_set, self.du_set)
+        if self._sets is None or any(now is not then for now, then in zip(owners, self._sets[0], strict=True)):
+            data = self.data
+            sets = [("u_set", self.u_set, data.n_u), ("y_set", self.y_set, data.n_y)]
+            if self.terms.rates:
+                sets.append(("du_set", Reals() if self.du_set is None else self.du_set, data.n_u))
+            stacked = FeasibleSet.of((name, owner, data.horizon, n) for name, owner, n in sets)
+            self._sets = (owners, stacked)
+        return self._sets[1]
 
     @property
     def reduced_kkt_size(self) -> int:
-        """Unknowns of the system that the reduced backward solves: horizon (n_u + n_y)."""
-        return self.data.horizon * (self.data.n_u + self.data.n_y)
+        """Unknowns of the reduced system: horizon (n_u + n_y), horizon n_u more where changes of the input count."""
+        return self.sizes.v
 
     @property
     def full_kkt_size(self) -> int:
         """Unknowns of the paper's system: 2 horizon (n_u + n_y) + t_ini n_u + n_g."""
-        return 2 * self.reduced_kkt_size + self.data.t_ini * self.data.n_u + self.data.n_g
+        data = self.data
+        return 2 * data.horizon * (data.n_u + data.n_y) + data.t_ini * data.n_u + data.n_g
 
     def forward(
         self, u_ini: Any, y_ini: Any, *, y_ref: Any = None, u_ref: Any = None, on_failure: str | None = None
@@ -121,8 +179,17 @@ class DPCLayer(nn.Module):
             InfeasibleError: a sample has no solution, provably (with `on_failure="raise"`).
             SolveError: a sample could not be solved (likewise).
         """
+        if torch.compiler.is_compiling():  # a compiled model breaks its graph here
+            return _uncompiled()(self, u_ini, y_ini, y_ref, u_ref, on_failure)
+        return self._call(u_ini, y_ini, y_ref, u_ref, on_failure)
+
+    def _call(self, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any, on_failure: str | None) -> DPCSolution:
         theta, dtype = self.flatten(u_ini, y_ini, y_ref, u_ref)
-        return self.plan(theta, *self.bounds(theta.device), dtype=dtype, on_failure=on_failure)
+        if self.feasible_set.is_box:
+            return self.plan(theta, *self.bounds(theta.device), dtype=dtype, on_failure=on_failure)
+        reduction, solver = self._factors(theta.device)
+        planned = _with_failures(solver, on_failure).plan(theta, reduction)
+        return self._solution(planned, theta, reduction, solver, dtype)
 
     def plan(
         self,
@@ -137,19 +204,22 @@ class DPCLayer(nn.Module):
 
         Args:
             theta: (u_ini, y_ini, u_ref, y_ref) flattened, `(*batch, n_theta)`, float64.
-            lower, upper: bounds of (u, y) flattened, `(horizon (n_u + n_y),)` or one a sample, float64.
+            lower, upper: bounds of (u, y, du) flattened, `(N,)` or one a sample, float64.
             dtype: of the plan.
             on_failure: in place of the layer's own.
         """
         reduction, solver = self._factors(theta.device)
-        if on_failure is not None and on_failure != solver.on_failure:
-            _check_choice("on_failure", on_failure, ("raise", "nan"))
-            solver = solver.with_failures(on_failure)
-        u, y, lam, _, info = solve_reduced(solver, theta, reduction, lower, upper)
+        planned = solve_reduced(_with_failures(solver, on_failure), theta, reduction, lower, upper)
+        return self._solution(planned, theta, reduction, solver, dtype)
+
+    def _solution(
+        self, planned: Planned, theta: Tensor, reduction: Reduction, solver: Any, dtype: torch.dtype
+    ) -> DPCSolution:
+        u, y, lam, _, info = planned
         return DPCSolution(
             u=u if dtype == torch.float64 else u.to(dtype),
             y=y if dtype == torch.float64 else y.to(dtype),
-            info=SolveInfo(info, reduction.is_selection),
+            info=SolveInfo(info, reduction.is_selection, lambda: self._nonsingular(solver, theta, planned)),
             lam=lam,
             _make_g=lambda: self._g(reduction, theta, lam, info).to(dtype),
         )
@@ -161,9 +231,57 @@ class DPCLayer(nn.Module):
         """
         theta, _ = self.flatten(u_ini, y_ini, y_ref, u_ref)
         weights = self._weights(theta.device)
-        if weights.Q.ndim + weights.R.ndim + weights.lambda_g.ndim + weights.lambda_s.ndim > 4:
-            raise ValueError("`compact_form` takes one problem; the weights have a batch dimension.")
-        return compact_form(self.data, weights, theta)
+        if weights.are_batched or isinstance(self.data, HankelBatch):
+            raise ValueError("`compact_form` takes one problem; the weights or the data have a batch dimension.")
+        if self.du_set is not None:
+            raise ValueError("`compact_form` has no rows for changes of the input; leave out `du_set`.")
+        return compact_form(self.data, weights, theta, self.terms)
+
+    def config(self) -> dict[str, Any]:
+        """Return the arguments of the constructor beyond the data, as they are now."""
+        return {
+            "Q": self.Q,
+            "R": self.R,
+            "lambda_g": self.lambda_g,
+            "lambda_s": self.lambda_s,
+            "u_set": self.u_set,
+            "y_set": self.y_set,
+            "du_set": self.du_set,
+            "R_du": self.R_du,
+            "lambda_u": self.lambda_u,
+            "regularizer": self.regularizer,
+            "terminal_steps": self.terminal_steps,
+            "backward": self.backward_system,
+            "solver": self.solver,
+            "on_failure": self.on_failure,
+        }
+
+    def save(self, path: str | os.PathLike[str], *, data: bool = False) -> None:
+        """Write the layer to a safetensors file: weights, sets, settings and the data, without pickle.
+
+        Parameters, tensors and numbers come back as what they are; of a tensor that a graph made, its value is kept.
+
+        Args:
+            path: of the file, which is replaced.
+            data: write the recorded windows, for `sol.g`. Otherwise the data are written compact: the file is small
+                whatever the number of windows, plans are the same, and `sol.g` raises.
+
+        Raises:
+            ValueError: a set that is not known (:func:`torch_dpc.register_set`); windows asked of compact data.
+            ImportError: safetensors is missing.
+        """
+        save_layer(self, path, data=data)
+
+    @classmethod
+    def load(cls, path: str | os.PathLike[str]) -> DPCLayer:
+        """Return the layer that :meth:`save` wrote, on the CPU.
+
+        Raises:
+            ValueError: a damaged file, another version of the format, or a set that is not known.
+            ImportError: safetensors is missing.
+        """
+        layer: DPCLayer = load_layer(cls, path)
+        return layer
 
     def extra_repr(self) -> str:
         """Describe the data and the sizes of the systems that are solved."""
@@ -198,11 +316,13 @@ class DPCLayer(nn.Module):
             R=weight_matrix("R", self.R, data.n_u, data.horizon).to(device),
             lambda_g=penalty("lambda_g", self.lambda_g).to(device),
             lambda_s=penalty("lambda_s", self.lambda_s).to(device),
+            lambda_u=None if self.lambda_u is None else penalty("lambda_u", self.lambda_u).to(device),
+            R_du=None if self.R_du is None else weight_matrix("R_du", self.R_du, data.n_u, data.horizon).to(device),
         )
 
-    def _factors(self, device: torch.device) -> tuple[Reduction, Solver]:
+    def _factors(self, device: torch.device) -> tuple[Reduction, Any]:
         """Return the reduced problem and its solver; with a graph, which must not outlive the call, made each time."""
-        weights = (self.Q, self.R, self.lambda_g, self.lambda_s)
+        weights = (self.Q, self.R, self.lambda_g, self.lambda_s, self.lambda_u, self.R_du)
         if carries_derivative((*weights, *self.data.matrices)):
             return self._factor(device)
         settings = (self.solver, self.on_failure, self.backward_system)
@@ -210,11 +330,18 @@ class DPCLayer(nn.Module):
         return self._cached(("factors", device), (*weights, *settings, self.data), self._factor, device)
 
     def bounds(self, device: torch.device) -> tuple[Tensor, Tensor]:
-        """Return the bounds of (u, y) flattened, `(horizon (n_u + n_y),)` each, float64, with their graph."""
-        sources = (self.u_set.lower, self.u_set.upper, self.y_set.lower, self.y_set.upper)
+        """Return the bounds of (u, y, du) flattened, `(N,)` or `(*batch, N)` each, float64, with their graph.
+
+        Raises:
+            ValueError: a set is no box.
+        """
+        sets = self.feasible_set
+        if not sets.is_box:
+            raise ValueError("the sets of this layer are not all boxes: they have no bounds.")
+        sources = tuple(bound for owner, _ in sets.parts for bound in (owner.lower, owner.upper))
         if carries_derivative(sources):
-            return stacked_bounds(self.u_set, self.y_set, self.data, device)
-        return self._cached(("bounds", device), sources, stacked_bounds, self.u_set, self.y_set, self.data, device)
+            return sets.bounds(device)
+        return self._cached(("bounds", device), sources, sets.bounds, device)
 
     def _cached(self, key: tuple[str, torch.device], sources: tuple[Any, ...], make: Any, *args: Any) -> Any:
         """Return what `make` makes of the sources, made anew when their values have changed."""
@@ -225,9 +352,17 @@ class DPCLayer(nn.Module):
                 entry = self._cache[key] = (kept, make(*args))
         return entry[1]
 
-    def _factor(self, device: torch.device) -> tuple[Reduction, Solver]:
-        reduction = reduce(DataRows.of(self.data, device), self._weights(device))
+    def _rows(self, device: torch.device) -> DataRows:
+        """Return the rows of the data; weights that learn leave them alone."""
+        if carries_derivative(self.data.matrices):
+            return _rows_of(self.data, device, self.terms)
+        return self._cached(("rows", device), (self.data,), _rows_of, self.data, device, self.terms)
+
+    def _factor(self, device: torch.device) -> tuple[Reduction, Solver | ConvexSolver]:
+        reduction = reduce(self._rows(device), self._weights(device))
         detached = reduction.detach()
+        if not self.feasible_set.is_box:
+            return reduction, ConvexSolver(detached, self.sizes, self.feasible_set, self.on_failure)
         full = None
         if self.backward_system == "full":
             if reduction.V.requires_grad or reduction.V.ndim > 2:
@@ -235,22 +370,44 @@ class DPCLayer(nn.Module):
                     'backward="full" differentiates with respect to measurements and references of one problem; '
                     'use backward="reduced" for weights or data that learn, or have a batch dimension.'
                 )
+            if self.terms != Terms():
+                raise ValueError('backward="full" is the system of the paper\'s problem; use backward="reduced".')
+            assert isinstance(self.data, HankelData)  # batches were refused with the batched reductions
             full = FullSystem(self.data, detached.weights)
         return reduction, Solver(detached, self.sizes, self.solver, self.on_failure, full)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the factors out of copies and pickles: they are made again when needed."""
-        return {**self.__dict__, "_cache": {}}
+        return {**self.__dict__, "_cache": {}, "_sets": None}
+
+    def _nonsingular(self, solver: Any, theta: Tensor, planned: Planned) -> Tensor:
+        reduction, data = solver.reduction, self.data
+        # The part of g that the data do not see is fixed by lambda_g alone.
+        fixed = (reduction.weights.lambda_g > 0) | (torch.as_tensor(data.rank) == data.n_g)
+        decided = reduction.rows.Eq_range is None and not reduction.is_selection
+        with torch.no_grad():
+            return solver.independent(theta.detach(), planned) & fixed & decided
 
     def _g(self, reduction: Reduction, theta: Tensor, lam: Tensor, info: Tensor) -> Tensor:
+        self.data.require_windows()
         a = times(reduction.A_theta, theta) - times(reduction.A_lam, lam)
-        basis = self.data.row_space.basis.to(a.device)
+        g = times(basis := self.data.basis.to(a.device), a)
         if reduction.rows.C.requires_grad:  # g = D^+ (D g), so that the data behind D are differentiated too
-            D = torch.cat([m.to(a) for m in self.data.matrices])
+            D = self.data.stacked.to(a.device)
             g = times(torch.linalg.pinv(D, rtol=1e-10), times(D @ basis, a))
-        else:
-            g = a @ basis.mT
         return torch.where(info[..., :1] == Status.SOLVED, g, torch.nan)
+
+
+def _rows_of(data: HankelData | HankelBatch, device: torch.device, terms: Terms) -> DataRows:
+    if isinstance(data, HankelData):
+        return DataRows.of(data, device, terms)
+    return DataRows.stack([DataRows.of(one, device, terms) for one in data.members])
+
+
+@functools.cache
+def _uncompiled() -> Any:
+    """`DPCLayer._call` out of the compiler's reach; made when it is there, because importing it takes a second."""
+    return torch.compiler.disable(DPCLayer._call)
 
 
 def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
@@ -258,16 +415,29 @@ def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
         raise ValueError(f"`{name}` must be one of {', '.join(map(repr, choices))}, got {value!r}.")
 
 
-def _as_box(name: str, value: Any) -> Box:
-    if value is None:
-        return Reals()
-    if not isinstance(value, Box):
-        raise ValueError(f"`{name}` must be a Box, Reals or None, got {type(value).__name__}.")
+def _as_set(name: str, value: Any) -> ConvexSet:
+    if not isinstance(value, ConvexSet):
+        raise ValueError(f"`{name}` must be a ConvexSet or None, got {type(value).__name__}.")
     return value
+
+
+def _checked_steps(steps: Any, horizon: int) -> int:
+    if not isinstance(steps, int) or isinstance(steps, bool) or not 0 <= steps <= horizon:
+        raise ValueError(f"`terminal_steps` must be an integer from 0 to the horizon, {horizon}, got {steps!r}.")
+    return steps
+
+
+def _with_failures(solver: Any, on_failure: str | None) -> Any:
+    if on_failure is None or on_failure == solver.on_failure:
+        return solver
+    _check_choice("on_failure", on_failure, ("raise", "nan"))
+    return solver.with_failures(on_failure)
 
 
 def _is_same(kept: Any, now: Any) -> bool:
     """Compare values: version counters would be cheaper, but miss edits through `.data`."""
+    if kept is now:  # no tensor: those are kept as copies
+        return True
     if isinstance(kept, Tensor) and isinstance(now, Tensor):
         if kept.device != now.device:
             kept = kept.to(now.device)

@@ -5,9 +5,12 @@ on them, rows whose multiplier has the wrong sign are let go, and
 
     lam_A = G[A, A]^-1 (v0 - bound)_A,    lam = 0 elsewhere
 
-(the primal-dual active set method; Hintermueller, Ito, Kunisch 2002). It ends, exactly, when the set repeats. The first
-set comes from a few accelerated gradient steps on the multipliers in single precision, which are matrix products alone
-and cost less than one Newton step; it is nearly right, so one or two steps finish.
+(the primal-dual active set method; Hintermueller, Ito, Kunisch 2002). It ends, exactly, when the set repeats.
+
+On the CPU the compiled kernel takes the samples one by one, from a first set that a few sweeps of coordinate descent on
+the multipliers find. Elsewhere all samples step together in operations of torch, and the first set comes from a few
+accelerated gradient steps in single precision, which are matrix products alone and cost less than one Newton step.
+Either start is nearly right, so one or two steps finish.
 """
 
 from __future__ import annotations
@@ -17,7 +20,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from . import kernels
 from .active_set import solve_active
+from .kernels import HYSTERESIS
 
 #: Steps after which a sample is left to the second engine; converging samples need 2 to 7.
 MAX_STEPS = 20
@@ -25,9 +30,6 @@ MAX_STEPS = 20
 NEAR = 0.2
 #: Accelerated gradient steps before the first Newton step. On the masses, 15 leave 1.2 Newton steps a sample of 3.3.
 GRADIENT_STEPS = 15
-#: By how much v + lam must pass a bound (relative to 1 + |bound|) for its row to be active. Without it rounding makes
-#: the set flicker at rows that only touch their bound.
-HYSTERESIS = 1e-12
 
 
 @dataclass
@@ -47,6 +49,20 @@ def solve_newton(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor
         v0: the unconstrained minimisers, `(B, N)`.
         lower, upper: `(N,)` or `(B, N)`.
     """
+    if kernels.serve(v0):
+        return _by_kernel(G, v0, lower, upper)
+    return _together(G, Ct, v0, lower, upper)
+
+
+def _by_kernel(G: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> ActiveSetResult:
+    if lower.ndim != upper.ndim:
+        lower, upper = lower.expand_as(v0), upper.expand_as(v0)
+    G_array, centre, low, high = (kernels.as_array(x) for x in (G, v0, lower, upper))
+    found = kernels.solve_boxes(G_array, centre, low, high, torch.get_num_threads())
+    return ActiveSetResult(*map(torch.from_numpy, found))
+
+
+def _together(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> ActiveSetResult:
     result = ActiveSetResult(
         lam=torch.zeros_like(v0),
         iterations=torch.zeros(len(v0), dtype=torch.int64, device=v0.device),

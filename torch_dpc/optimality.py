@@ -20,6 +20,7 @@ import numpy as np
 import torch
 
 from .reduction import Reduction
+from .rows import Tracking
 
 #: A row is weakly active where its distance to the bound, and the displacement G_ii lam_i that its multiplier makes,
 #: are both at most this, relative to 1 + |bound|. Such a row counts as inactive in every derivative.
@@ -43,6 +44,7 @@ class Arithmetic:
         clip: (x, lower, upper) -> the nearest point between the bounds.
         combine: (lam, rows) -> lam' rows, where most of lam is zero.
         count: how many entries of the last dimension are true.
+        join: parts of vectors -> the vectors.
     """
 
     array: Callable[[torch.Tensor], Any]
@@ -50,6 +52,7 @@ class Arithmetic:
     clip: Callable[[Any, Any, Any], Any]
     combine: Callable[[Any, Any], Any]
     count: Callable[[Any], Any]
+    join: Callable[[list[Any]], Any]
 
 
 BATCHED = Arithmetic(
@@ -58,6 +61,7 @@ BATCHED = Arithmetic(
     clip=torch.clamp,
     combine=lambda lam, rows: _times(rows.mT, lam),
     count=lambda flags: flags.sum(-1),
+    join=lambda parts: torch.cat(parts, dim=-1),
 )
 SINGLE = Arithmetic(
     array=lambda tensor: tensor.numpy(),
@@ -65,6 +69,7 @@ SINGLE = Arithmetic(
     clip=lambda x, lower, upper: np.minimum(np.maximum(x, lower), upper),
     combine=lambda lam, rows: lam[held := lam.nonzero()[0]] @ rows[held],
     count=np.count_nonzero,
+    join=np.concatenate,
 )
 
 
@@ -98,18 +103,30 @@ class Optimality:
         rows, weights = reduction.rows, reduction.weights
         array = arithmetic.array
         self._norm, self._clip, self._combine = arithmetic.norm, arithmetic.clip, arithmetic.combine
-        self._count = arithmetic.count
-        self._n_up, self._n_yp, self._n_u = rows.Up.shape[0], rows.Yp.shape[0], rows.Uf.shape[0]
-        self._rank_W = rows.rank_W
+        self._count, self._join = arithmetic.count, arithmetic.join
         self._A_theta, self._A_lam = array(reduction.A_theta), array(reduction.A_lam.mT.contiguous())
         self._diagonal = array(reduction.G.diagonal(dim1=-2, dim2=-1).contiguous())
-        self._Up, self._Yp, self._C, self._Z = (array(m) for m in (rows.Up, rows.Yp, rows.C, rows.Z))
-        self._R, self._Q = array(weights.R), array(weights.Q)
-        self._weight_g, self._weight_s = array(2 * weights.lambda_g[..., None]), array(2 * weights.lambda_s[..., None])
-        self._size_Up = float(rows.Up.norm())
-        largest = max(float(torch.linalg.matrix_norm(m, ord=2).max()) for m in (weights.R, weights.Q))
+        self._Eq, self._C, self._Z = (array(m) for m in (rows.Eq, rows.C, rows.Z))
+        self._Eq_theta = _as_slice(rows.Eq_theta)
+        self._weight_g = array(2 * weights.lambda_g[..., None] * rows.charged)
+        self._fits = [
+            (
+                array(fit.rows),
+                array(2 * getattr(weights, fit.weight)[..., None]),
+                slice(fit.measured, fit.measured + fit.rows.shape[-2]),
+            )
+            for fit in rows.fits
+        ]
+        tracking = [(term, getattr(weights, term.weight)) for term in rows.tracking]
+        self._tracking = [
+            (term.rows, None if weight is None else array(weight), _reference_of(term)) for term, weight in tracking
+        ]
+        self._size_Eq = float(rows.Eq.norm())
+        largest = max(float(w.abs().sum(-1).max()) for _, w in tracking if w is not None)  # bounds the norm
         self._floor = CANCELLATION * largest * float(rows.C.norm())
-        self._rounding = ROUNDING * float(weights.lambda_s.max()) * float(rows.Yp.norm()) ** 2
+        self._rounding = ROUNDING * sum(
+            float(getattr(weights, fit.weight).max()) * float(fit.rows.norm()) ** 2 for fit in rows.fits
+        )
 
     def unconstrained(self, theta: Any) -> tuple[Any, Any]:
         """Return the unconstrained minimiser, as a and as v = C a."""
@@ -121,7 +138,7 @@ class Optimality:
         a = a0 - self._combine(lam, self._A_lam)
         raw = _times(self._C, a)
         v = self._clip(raw + lam, lower, upper)  # at a solution this is raw, and a row that lam holds is on its bound
-        residual = self._residual(theta, a, raw, v, v0, lam)
+        residual = self.residual(theta, a, raw, v, v0, lam)
         reach = WEAKLY_ACTIVE * (1 + abs(v))
         # A difference to an infinite bound is infinite, and so never within reach.
         touching = (upper - v <= reach) | (v - lower <= reach)
@@ -130,30 +147,57 @@ class Optimality:
         n_active = self._count(active)
         return Judged(v, residual, active, n_active, self._count(touching) - n_active)
 
-    def _residual(self, theta: Any, a: Any, v: Any, projected: Any, v0: Any, lam: Any) -> Any:
-        norm, n_u, n_up = self._norm, self._n_u, self._n_up
-        u_ini, y_ini, refs = theta[..., :n_up], theta[..., n_up : n_up + self._n_yp], theta[..., n_up + self._n_yp :]
+    def residual(self, theta: Any, a: Any, v: Any, projected: Any, v0: Any, lam: Any) -> Any:
+        """Return the sum over the blocks of |F| relative to its terms, given v = C a and Proj(v + lam)."""
+        norm = self._norm
         # z - Proj_D(z - P z - q - H'w), the rows of u and y; u = Uf g and y = Yf g hold because v is C a
         size_v = norm(v)
         in_set = norm(v - projected) / (size_v + norm(v0) + _TINY)
-        # Up g = u_ini
-        past = norm(_times(self._Up, a) - u_ini) / (norm(u_ini) + self._size_Up * norm(a) + _TINY)
+        # Up g = u_ini, and what else is held
+        wanted = theta[..., self._Eq_theta]
+        held = norm(_times(self._Eq, a) - wanted) / (norm(wanted) + self._size_Eq * norm(a) + _TINY)
         # 2 lambda_g M g + 2 lambda_s Yp'(Yp g - y_ini) + Uf'w_u + Yf'w_y, on the kernel of Up
-        w = v - refs
-        w_u, w_y = _times(self._R, w[..., :n_u]), _times(self._Q, w[..., n_u:])
-        of_Yp, of_y_ini = (self._weight_s * _times(self._Yp, a)) @ self._Yp, (self._weight_s * y_ini) @ self._Yp
-        of_w = (w_u + lam[..., :n_u]) @ self._C[:n_u] + (w_y + lam[..., n_u:]) @ self._C[n_u:]
-        of_M = self._weight_g * a[..., self._rank_W :]
-        total = of_Yp - of_y_ini + of_w
-        total[..., self._rank_W :] += of_M
-        terms = norm(of_Yp) + norm(of_y_ini) + norm(of_w) + norm(of_M)
-        terms = terms + self._floor * (size_v + norm(refs)) + self._rounding * norm(a)
-        stationary = norm(total @ self._Z) / (terms + _TINY)
-        return in_set + past + stationary
+        total, size_refs = self._tracked(theta, v, lam)
+        terms = norm(total) + self._floor * (size_v + size_refs) + self._rounding * norm(a)
+        for S, weight, measured in self._fits:
+            of_rows, of_measured = _back(weight * _times(S, a), S), _back(weight * theta[..., measured], S)
+            total = total + (of_rows - of_measured)
+            terms = terms + norm(of_rows) + norm(of_measured)
+        of_M = self._weight_g * a
+        stationary = norm(_back(total + of_M, self._Z)) / (terms + norm(of_M) + _TINY)
+        return in_set + held + stationary
+
+    def _tracked(self, theta: Any, v: Any, lam: Any) -> tuple[Any, Any]:
+        """Return C'(W (v - v_ref) + lam) and the size of v_ref."""
+        w, size = [], 0.0
+        for rows, weight, reference in self._tracking:
+            part = v[..., rows]
+            if reference is not None:
+                part = part - theta[..., reference]
+                size = size + self._norm(theta[..., reference])
+            w.append(lam[..., rows] if weight is None else lam[..., rows] + _times(weight, part))
+        return _back(self._join(w), self._C), size
+
+
+def _as_slice(places: torch.Tensor) -> Any:
+    """Return the places as a slice where they are one: a view costs less than a copy."""
+    start = int(places[0]) if len(places) else 0
+    one_run = torch.equal(places.cpu(), torch.arange(start, start + len(places)))
+    return slice(start, start + len(places)) if one_run else places
+
+
+def _reference_of(term: Tracking) -> slice | None:
+    if term.reference is None:
+        return None
+    return slice(term.reference, term.reference + term.rows.stop - term.rows.start)
 
 
 #: Keeps 0 / 0 at 0.
 _TINY = 1e-300
+
+
+def _back(x: Any, matrix: Any) -> Any:
+    return x @ matrix if matrix.ndim == 2 else (x[..., None, :] @ matrix)[..., 0, :]
 
 
 def _times(matrix: Any, x: Any) -> Any:

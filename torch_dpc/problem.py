@@ -15,13 +15,9 @@ import torch
 from torch import Tensor
 
 from .hankel import HankelData
-from .reduction import Weights
-from .sets import Box
-
-#: Asymmetry of Q or R, relative to its largest entry, up to which it is rounding and is averaged away.
-ASYMMETRY = 1e-6
-#: An eigenvalue of Q or R below minus this fraction of the largest makes the matrix indefinite.
-NEGATIVE_EIGENVALUE = 1e-9
+from .hankel_batch import HankelBatch
+from .rows import Terms
+from .weights import Weights
 
 
 class CompactForm(NamedTuple):
@@ -33,108 +29,31 @@ class CompactForm(NamedTuple):
     b: Tensor
 
 
-def weight_matrix(name: str, value: Any, channels: int, horizon: int) -> Tensor:
-    """Return Q or R of the whole horizon, `(..., horizon n, horizon n)` in float64, symmetric; a graph is kept.
-
-    Args:
-        name: "Q" or "R", for messages.
-        value: a number, one step's `(..., n, n)`, or the whole horizon's `(..., horizon n, horizon n)`.
-        channels: n.
-        horizon: steps of the plan.
-
-    Raises:
-        ValueError: another shape, asymmetry above rounding, or a negative eigenvalue.
-    """
-    matrix = as_weight(name, value)
-    if matrix.ndim == 0:
-        matrix = matrix * torch.eye(channels, dtype=matrix.dtype, device=matrix.device)
-    size = channels * horizon
-    if matrix.ndim < 2 or matrix.shape[-2:] not in {(channels, channels), (size, size)}:
-        raise ValueError(
-            f"`{name}` must be a number or have shape ({channels}, {channels}) for one step or ({size}, {size}) for "
-            f"the whole horizon, got {tuple(matrix.shape)}."
-        )
-    transposed = matrix.mT
-    with torch.no_grad():
-        largest = matrix.abs().amax()
-        asymmetry = (matrix - transposed).abs().amax()
-        if asymmetry > ASYMMETRY * largest:
-            raise ValueError(f"`{name}` must be symmetric, got entries that differ by {float(asymmetry):.1e}.")
-        smallest = torch.linalg.eigvalsh((matrix + transposed) / 2).amin()
-        if smallest < -NEGATIVE_EIGENVALUE * largest:
-            raise ValueError(f"`{name}` must be positive semidefinite, got an eigenvalue of {float(smallest):.1e}.")
-    matrix = (matrix + transposed) / 2
-    if matrix.shape[-1] == size:
-        return matrix
-    steps = torch.eye(horizon, dtype=matrix.dtype, device=matrix.device)
-    return torch.einsum("st,...ij->...sitj", steps, matrix).reshape(*matrix.shape[:-2], size, size)
-
-
-def penalty(name: str, value: Any) -> Tensor:
-    """Return lambda_g or lambda_s as float64, `(...)`; a graph is kept.
-
-    Raises:
-        ValueError: a negative value.
-    """
-    number = as_weight(name, value)
-    if bool((number.detach() < 0).any()):
-        raise ValueError(f"`{name}` must not be negative, got {float(number.detach().min()):g}.")
-    return number
-
-
-def as_weight(name: str, value: Any) -> Tensor:
-    """Return a weight as a finite float64 tensor; a graph is kept."""
-    if isinstance(value, bool):
-        raise ValueError(f"`{name}` must be a number or a tensor, got {value!r}.")
-    if isinstance(value, Tensor):
-        if not value.is_floating_point():
-            raise ValueError(f"`{name}` must hold floating-point numbers, got {value.dtype}.")
-        tensor = value.double()
-    else:
-        try:
-            tensor = torch.as_tensor(value, dtype=torch.float64)
-        except (TypeError, ValueError, RuntimeError) as error:
-            raise ValueError(f"`{name}` must be a number or a tensor, got {value!r}.") from error
-    if not bool(torch.isfinite(tensor.detach()).all()):
-        raise ValueError(f"`{name}` must be finite, got {tensor.detach().tolist()}.")
-    return tensor
-
-
-def stacked_bounds(u_set: Box, y_set: Box, data: HankelData, device: torch.device) -> tuple[Tensor, Tensor]:
-    """Return the bounds of v = (u, y), each `(horizon (n_u + n_y),)` in float64; a graph is kept."""
-    lower: list[Tensor] = []
-    upper: list[Tensor] = []
-    for name, box, channels in (("u_set", u_set, data.n_u), ("y_set", y_set, data.n_y)):
-        box.check()
-        shape = (data.horizon, channels)
-        like = torch.empty(0, dtype=torch.float64, device=device)
-        for bounds, value in zip((lower, upper), box.bounds(like), strict=True):
-            try:
-                whole = torch.broadcast_to(value, shape)
-            except RuntimeError as error:
-                raise ValueError(
-                    f"the bounds of `{name}` must be numbers or have shape ({channels},) or {shape}, "
-                    f"got {tuple(value.shape)}."
-                ) from error
-            bounds.append(whole.reshape(-1))
-    return torch.cat(lower), torch.cat(upper)
-
-
 @dataclass(frozen=True)
 class Sizes:
-    """How many entries each part of theta = (u_ini, y_ini, u_ref, y_ref) and of v = (u, y) has, and how many steps."""
+    """How many entries each part of theta = (u_ini, y_ini, u_ref, y_ref) and of v = (u, y, du) has, and how many steps.
+
+    du, the changes of the input, has entries only where the problem speaks of them.
+    """
 
     u_ini: int
     y_ini: int
     u: int
     y: int
     horizon: int
+    du: int = 0
 
     @staticmethod
-    def of(data: HankelData) -> Sizes:
+    def of(data: HankelData | HankelBatch, terms: Terms = Terms()) -> Sizes:  # noqa: B008
         """Read the sizes off the data."""
         past, future = data.t_ini, data.horizon
-        return Sizes(past * data.n_u, past * data.n_y, future * data.n_u, future * data.n_y, future)
+        n_u, n_y = data.n_u, data.n_y
+        return Sizes(past * n_u, past * n_y, future * n_u, future * n_y, future, future * n_u if terms.rates else 0)
+
+    @property
+    def v(self) -> int:
+        """The constrained rows, N."""
+        return self.u + self.y + self.du
 
     @property
     def theta(self) -> tuple[int, int, int, int]:
@@ -144,7 +63,7 @@ class Sizes:
     def split(self, v: Any) -> tuple[Any, Any]:
         """Return u `(..., horizon, n_u)` and y `(..., horizon, n_y)` of v, a tensor or an array `(..., N)`."""
         batch = v.shape[:-1]
-        u, y = v[..., : self.u], v[..., self.u :]
+        u, y = v[..., : self.u], v[..., self.u : self.u + self.y]
         return (
             u.reshape((*batch, self.horizon, self.u // self.horizon)),
             y.reshape((*batch, self.horizon, self.y // self.horizon)),
@@ -155,7 +74,8 @@ class Sizes:
         batch = like.shape[:-1]
         u = like.new_zeros(*batch, self.u) if u is None else u.reshape((*batch, self.u))
         y = like.new_zeros(*batch, self.y) if y is None else y.reshape((*batch, self.y))
-        return torch.cat([u, y], dim=-1)
+        parts = [u, y, like.new_zeros(*batch, self.du)] if self.du else [u, y]
+        return torch.cat(parts, dim=-1)
 
 
 def projector(data: HankelData) -> Tensor:
@@ -165,28 +85,48 @@ def projector(data: HankelData) -> Tensor:
     return torch.eye(data.n_g, dtype=in_W.dtype, device=in_W.device) - in_W @ in_W.T
 
 
-def compact_form(data: HankelData, weights: Weights, theta: Tensor) -> CompactForm:
-    """Return P, q, H, b as the paper writes them.
+def compact_form(data: HankelData, weights: Weights, theta: Tensor, terms: Terms = Terms()) -> CompactForm:  # noqa: B008
+    """Return P, q, H, b as the paper writes them, with what the problem has beyond the paper's.
+
+    A slack on u_ini moves Up from H to P, a weight on changes of the input widens R, and terminal steps are more rows
+    of H. A set of the changes is no part of z in D: it has no compact form.
 
     Args:
         data: the recorded data.
         weights: Q, R of the whole horizon, lambda_g, lambda_s; one problem.
         theta: (u_ini, y_ini, u_ref, y_ref) flattened, `(*batch, n_theta)`.
+        terms: what the problem has beyond the paper's.
 
     Returns:
         P `(n, n)`, q `(*batch, n)`, H `(m, n)`, b `(*batch, m)` with n = horizon (n_u + n_y) + n_g and
-        m = horizon (n_u + n_y) + t_ini n_u.
+        m = horizon (n_u + n_y) + t_ini n_u for the paper's terms.
     """
     sizes = Sizes.of(data)
     Up, Yp, Uf, Yf = (m.detach().to(theta) for m in data.matrices)
     Q, R = weights.Q.to(theta), weights.R.to(theta)
-    M = projector(data).to(theta)
-    of_g = 2 * weights.lambda_g * (M.T @ M) + 2 * weights.lambda_s * (Yp.T @ Yp)
-    P = torch.block_diag(R, Q, of_g)
     u_ini, y_ini, u_ref, y_ref = theta.split(sizes.theta, dim=-1)
-    q = -torch.cat([u_ref @ R, y_ref @ Q, 2 * weights.lambda_s * (y_ini @ Yp)], dim=-1)
-    minus_I = -torch.eye(sizes.u + sizes.y, dtype=theta.dtype, device=theta.device)
-    past = torch.cat([Up.new_zeros(sizes.u_ini, sizes.u + sizes.y), Up], dim=1)
-    future = torch.cat([minus_I, torch.cat([Uf, Yf])], dim=1)
-    b = torch.cat([u_ini, theta.new_zeros(*theta.shape[:-1], sizes.u + sizes.y)], dim=-1)
-    return CompactForm(P, q, torch.cat([past, future]), b)
+    M = torch.eye(data.n_g, dtype=theta.dtype, device=theta.device) if terms.identity else projector(data).to(theta)
+    of_g = 2 * weights.lambda_g * (M.T @ M) + 2 * weights.lambda_s * (Yp.T @ Yp)
+    q_u, q_g = u_ref @ R, 2 * weights.lambda_s * (y_ini @ Yp)
+    if weights.R_du is not None:
+        S = weights.R_du.to(theta)
+        change = torch.eye(sizes.u, dtype=theta.dtype, device=theta.device)
+        change = change - torch.diag(change.new_ones(sizes.u - data.n_u), -data.n_u)
+        before = torch.nn.functional.pad(u_ini[..., -data.n_u :], (0, sizes.u - data.n_u))
+        R, q_u = R + change.T @ S @ change, q_u + before @ S @ change
+    if weights.lambda_u is not None:
+        of_g = of_g + 2 * weights.lambda_u * (Up.T @ Up)
+        q_g = q_g + 2 * weights.lambda_u * (u_ini @ Up)
+    P = torch.block_diag(R, Q, of_g)
+    q = -torch.cat([q_u, y_ref @ Q, q_g], dim=-1)
+    n_v = sizes.u + sizes.y
+    eye = torch.eye(n_v, dtype=theta.dtype, device=theta.device)
+    H, b = [torch.cat([-eye, torch.cat([Uf, Yf])], dim=1)], [theta.new_zeros(*theta.shape[:-1], n_v)]
+    if not terms.slack:
+        H.insert(0, torch.cat([Up.new_zeros(sizes.u_ini, n_v), Up], dim=1))
+        b.insert(0, u_ini)
+    if terms.terminal_steps:
+        last = terms.terminal_steps * data.n_y
+        H.append(torch.cat([eye[-last:], eye.new_zeros(last, data.n_g)], dim=1))
+        b.append(y_ref[..., -last:])
+    return CompactForm(P, q, torch.cat(H), torch.cat(b, dim=-1))

@@ -22,7 +22,7 @@ from torch import Tensor
 from .hankel import HankelData
 from .linear import flatten_batch, lead_all
 from .problem import CompactForm, Sizes, compact_form
-from .reduction import Weights
+from .weights import Weights
 
 #: Rounds of scaling rows and columns. One round of rows alone leaves errors 30 times as large; more gain nothing.
 EQUILIBRATION_ROUNDS = 3

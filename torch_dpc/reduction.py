@@ -1,16 +1,17 @@
 """The exact reduction of the DPC problem to its constrained rows.
 
-With g = B a (see :mod:`torch_dpc.rowspace`) every quantity of the problem is small. Three steps remain:
+In the coordinates a of the row space of the data (:mod:`torch_dpc.rows`) two steps remain:
 
-1. Up g = u_ini is eliminated:  a = Up^+ u_ini + Z x,  Z a basis of the kernel of Up B.
-2. The cost is one weighted least squares  min 1/2 |E x - e|^2,  with the rows
-   sqrt(R) Uf,  sqrt(Q) Yf,  sqrt(2 lambda_g) M,  sqrt(2 lambda_s) Yp,  and e linear in theta = (u_ini, y_ini, u_ref,
+1. The equalities Eq a = e, Up g = u_ini above all, are eliminated:  a = Eq^+ e + Z x,  Z a basis of the kernel of Eq.
+2. The cost is one weighted least squares  min 1/2 |E x - f|^2,  with the rows
+   sqrt(R) Uf,  sqrt(Q) Yf,  sqrt(2 lambda_g) M,  sqrt(2 lambda_s) Yp,  and f linear in theta = (u_ini, y_ini, u_ref,
    y_ref).  A QR of E gives the triangle T; E'E is never formed, for it squares a condition of 1e5.
-3. The constrained rows v = (u, y) = C x + c are, in terms of their multipliers lam alone,
 
-       v = V theta - G lam,    G = Ct Ct',  Ct = C T^-1,    lam in the normal cone of U x Y at v,
+The constrained rows v = (u, y) = C a are then, in terms of their multipliers lam alone,
 
-   and a = A_theta theta - A_lam lam gives everything else back.
+    v = V theta - G lam,    G = Ct Ct',  Ct = C Z T^-1,    lam in the normal cone of U x Y at v,
+
+and a = A_theta theta - A_lam lam gives everything else back.
 
 Where E is rank-deficient the optimum is a set; the element of minimum norm |g| is selected by charging the kernel
 of E with `TIE_BREAK`, and `Reduction.is_selection` says so.
@@ -25,115 +26,17 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .hankel import HankelData
+from .rows import DataRows
 from .saddle import Saddle, known_solution
-from .transforms import carries_derivative
+from .weights import Weights, psd_root
 
 #: Singular values of E at or below this fraction of the largest make the optimum a set.
 COST_RANK_TOLERANCE = 1e-14
+#: A row of C whose part in the kernel of the equalities is at most this fraction of it is decided by them.
+DECIDED = 1e-12
 #: Weight on the kernel of E, relative to the largest singular value of E. Its square, 1e-12, is how far from the
 #: optimum (in relative cost curvature) the selected solution may be.
 TIE_BREAK = 1e-6
-#: How far u_ini may be from what the data can produce, relative to its norm.
-REACHABLE = 1e-8
-
-
-@dataclass(frozen=True, eq=False)
-class Weights:
-    """The weights as tensors; leading dimensions, if any, are one problem each.
-
-    Attributes:
-        Q: output weight, `(..., horizon n_y, horizon n_y)`.
-        R: input weight, `(..., horizon n_u, horizon n_u)`.
-        lambda_g, lambda_s: regularisation of g and of the initial output, `(...)`.
-    """
-
-    Q: Tensor
-    R: Tensor
-    lambda_g: Tensor
-    lambda_s: Tensor
-
-
-@dataclass(frozen=True, eq=False)
-class DataRows:
-    """The data in the coordinates of their own row space, n_g gone.
-
-    Attributes:
-        Up, Yp, Uf, Yf: the rows, `(rows, r)`.
-        C: [Uf; Yf], `(horizon (n_u + n_y), r)`.
-        Up_pinv: the pseudo-inverse of Up, `(r, t_ini n_u)`.
-        Z: orthonormal basis of the kernel of Up, `(r, n_x)`.
-        u_ini_range: orthonormal basis of the range of Up, or None where every u_ini can be produced.
-        rank_W: the first entries of a, which |M g| does not charge.
-    """
-
-    Up: Tensor
-    Yp: Tensor
-    Uf: Tensor
-    Yf: Tensor
-    C: Tensor
-    Up_pinv: Tensor
-    Z: Tensor
-    u_ini_range: Tensor | None
-    rank_W: int
-
-    def unreachable(self, theta: Tensor) -> Tensor:
-        """Return which samples `(B,)` ask for a u_ini that no combination of the data makes."""
-        u_ini = theta[..., : self.Up.shape[0]]
-        if self.u_ini_range is None:
-            return torch.zeros(u_ini.shape[:-1], dtype=torch.bool, device=u_ini.device)
-        missed = u_ini - (u_ini @ self.u_ini_range) @ self.u_ini_range.mT
-        norm = torch.linalg.vector_norm
-        return norm(missed, dim=-1) > REACHABLE * norm(u_ini, dim=-1)
-
-    @staticmethod
-    def of(data: HankelData, device: torch.device) -> DataRows:
-        """Return the rows of the data; a graph behind the data matrices reaches through."""
-        space = data.row_space
-        if not space.clear and carries_derivative(data.matrices):
-            raise ValueError(
-                "the data carry a graph, but their rank is not clear, and derivatives hold at constant rank: the "
-                f"singular values around the decision are {space.last_kept:.1e} (kept) and {space.first_dropped:.1e} "
-                "(dropped), relative to the largest."
-            )
-        basis = space.basis.to(device)
-        stacked = torch.cat([m.to(device=device, dtype=torch.float64) for m in data.matrices])
-        rows = _InRowSpace.apply(stacked, basis) if carries_derivative(data.matrices) else stacked @ basis
-        Up, Yp, Uf, Yf = rows.split([len(m) for m in data.matrices])
-        with torch.no_grad():
-            left, singular, right_h = torch.linalg.svd(Up, full_matrices=True)
-            # The rank of Up is judged on channels of one scale too: rows are few and alike, its own norm will do.
-            rank = int((singular > 1e-10 * singular[0].clamp_min(torch.finfo(torch.float64).tiny)).sum())
-            kept = right_h[:rank].T
-            Up_pinv = (kept / singular[:rank]) @ left[:, :rank].T
-            u_ini_range = None if rank == Up.shape[0] else left[:, :rank].contiguous()
-            Z = right_h[rank:].T.contiguous()
-        return DataRows(Up, Yp, Uf, Yf, torch.cat([Uf, Yf]), Up_pinv, Z, u_ini_range, space.rank_W)
-
-
-class _InRowSpace(torch.autograd.Function):
-    """(D, B) -> D B for an orthonormal basis B of the rows of D, which moves with D.
-
-    What follows depends on D through D D' alone, so that to first order, and only so, B may be taken as fixed:
-    D_bar = bar B'. A derivative of that is refused.
-    """
-
-    @staticmethod
-    def forward(D: Tensor, basis: Tensor) -> Tensor:  # noqa: D102
-        return D @ basis
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:  # noqa: D102
-        ctx.save_for_backward(inputs[1])
-
-    @staticmethod
-    def backward(ctx: Any, bar: Tensor) -> tuple[Tensor, None]:  # noqa: D102
-        if torch.is_grad_enabled() and bar.requires_grad:
-            raise NotImplementedError(
-                "the derivative with respect to the recorded data is of first order: it cannot be taken with "
-                "`create_graph=True`. Detach the data, or ask for first derivatives."
-            )
-        return bar @ ctx.saved_tensors[0].mT, None
 
 
 @dataclass(frozen=True, eq=False)
@@ -160,10 +63,13 @@ class Reduction:
     is_selection: bool
 
     def detach(self) -> Reduction:
-        """Return the same numbers without their graph."""
-        rows = _map_tensors(self.rows, Tensor.detach)
-        weights = _map_tensors(self.weights, Tensor.detach)
-        return replace(_map_tensors(self, Tensor.detach), rows=rows, weights=weights)
+        """Return the same numbers without their graph.
+
+        With a graph G is C A_lam; here it is Ct Ct' in any case, which loses less, so that a graph changes no result.
+        """
+        rows, weights = (part.map(lambda tensor, _: tensor.detach()) for part in (self.rows, self.weights))
+        plain = _map_tensors(self, Tensor.detach)
+        return replace(plain, G=plain.Ct @ plain.Ct.mT, rows=rows, weights=weights)
 
     def of_batch(self, batch: torch.Size) -> Reduction:
         """Return one problem a sample of a flattened batch; itself where all samples share one problem."""
@@ -174,16 +80,16 @@ class Reduction:
             own = x.shape[x.ndim - tail :]
             return x.expand(*batch, *own).reshape(batch.numel(), *own)
 
-        w = self.weights
-        weights = Weights(spread(w.Q, 2), spread(w.R, 2), spread(w.lambda_g, 0), spread(w.lambda_s, 0))
-        return replace(_map_tensors(self, lambda x: spread(x, 2)), weights=weights)
+        rows = self.rows if self.rows.C.ndim == 2 else self.rows.map(spread)
+        return replace(_map_tensors(self, lambda x: spread(x, 2)), rows=rows, weights=self.weights.map(spread))
 
     def of_samples(self, samples: Tensor) -> Reduction:
         """Return the problems of some samples of a flattened batch; itself where all share one problem."""
         if self.G.ndim == 2:
             return self
-        weights = _map_tensors(self.weights, lambda tensor: tensor[samples])
-        return replace(_map_tensors(self, lambda tensor: tensor[samples]), weights=weights)
+        weights = self.weights.map(lambda tensor, _: tensor[samples])
+        rows = self.rows if self.rows.C.ndim == 2 else self.rows.map(lambda tensor, _: tensor[samples])
+        return replace(_map_tensors(self, lambda tensor: tensor[samples]), rows=rows, weights=weights)
 
 
 def _map_tensors(holder: Any, change: Callable[[Tensor], Tensor]) -> Any:
@@ -203,17 +109,21 @@ def reduce(rows: DataRows, weights: Weights) -> Reduction:
     the derivative of the saddle-point system they solve (:mod:`torch_dpc.saddle`).
     """
     with torch.no_grad():
-        E, e = _least_squares(rows, weights)
+        E, f = _least_squares(rows, weights)
         T, Qe, is_selection = _factor(E)
-        Ct = torch.linalg.solve_triangular(T, rows.C @ rows.Z, upper=True, left=False)
-        X_theta = torch.linalg.solve_triangular(T, Qe.mT @ e, upper=True)
+        CZ = rows.C @ rows.Z
+        # A row that the equalities decide is zero here; its rounding would stand for a motion that does not exist.
+        decided = CZ.norm(dim=-1) <= DECIDED * rows.C.norm(dim=-1)
+        CZ = torch.where(decided[..., None], 0.0, CZ)
+        Ct = torch.linalg.solve_triangular(T, CZ, upper=True, left=False)
+        X_theta = torch.linalg.solve_triangular(T, Qe.mT @ f, upper=True)
         # One step of refinement: it matters where weights of zero leave E a condition of 1e10.
-        X_theta = X_theta + torch.linalg.solve_triangular(T, Qe.mT @ (e - E @ X_theta), upper=True)
+        X_theta = X_theta + torch.linalg.solve_triangular(T, Qe.mT @ (f - E @ X_theta), upper=True)
         A_theta = rows.Z @ X_theta
-        A_theta[..., :, : rows.Up.shape[0]] += rows.Up_pinv
+        A_theta[..., :, rows.Eq_theta] += rows.Eq_pinv
         A_lam = rows.Z @ torch.linalg.solve_triangular(T, Ct.mT, upper=True)
         V, G = rows.C @ A_theta, Ct @ Ct.mT
-    tensors = (rows.C, rows.Yp, weights.Q, weights.R, weights.lambda_g, weights.lambda_s)
+    tensors = (rows.C, rows.Yp, *weights.tensors.values())
     if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):
         A_theta, A_lam = _with_graph(rows, weights, T, A_theta, A_lam)
         V, G = rows.C @ A_theta, rows.C @ A_lam
@@ -221,25 +131,27 @@ def reduce(rows: DataRows, weights: Weights) -> Reduction:
 
 
 def _least_squares(rows: DataRows, weights: Weights) -> tuple[Tensor, Tensor]:
-    """Return E `(..., k, n_x)` and the matrix of e = (matrix) theta, `(..., k, n_theta)`."""
-    root_R, root_Q = psd_root(weights.R), psd_root(weights.Q)
+    """Return E `(..., k, n_x)` and the matrix of f = (matrix) theta, `(..., k, n_theta)`."""
+    # Each block row of the cost, with the matrix that makes its target of a part of theta, and where that part begins.
     root_g = (2 * weights.lambda_g).sqrt()[..., None, None]
-    root_s = (2 * weights.lambda_s).sqrt()[..., None, None]
-    n_up, n_yp, n_u, n_y = (m.shape[0] for m in (rows.Up, rows.Yp, rows.Uf, rows.Yf))
-    # One block row each for sqrt(R) Uf, sqrt(Q) Yf, sqrt(2 lambda_g) M, sqrt(2 lambda_s) Yp.
-    blocks = [root_R @ rows.Uf, root_Q @ rows.Yf, root_g * _outside_W(rows), root_s * rows.Yp]
-    targets = [(n_up + n_yp, root_R), (n_up + n_yp + n_u, root_Q), None, (n_up, root_s * _eye(n_yp, rows.Yp))]
-    batch = torch.broadcast_shapes(*(b.shape[:-2] for b in blocks))
-    E, e = [], []
-    for block, target in zip(blocks, targets, strict=True):
+    blocks: list[tuple[Tensor, Tensor | None, int | None]] = [(root_g * _charged(rows), None, None)]
+    for term in rows.tracking:
+        if (weight := getattr(weights, term.weight)) is not None:
+            root = psd_root(weight)
+            blocks.append((root @ rows.C[..., term.rows, :], root, term.reference))
+    for fit in rows.fits:
+        root = (2 * getattr(weights, fit.weight)).sqrt()[..., None, None]
+        blocks.append((root * fit.rows, root * _eye(fit.rows.shape[-2], fit.rows), fit.measured))
+    batch = torch.broadcast_shapes(*(block.shape[:-2] for block, _, _ in blocks))
+    E, f = [], []
+    for block, matrix, start in blocks:
         E.append((block @ rows.Z).expand(*batch, -1, -1))
-        theta = block.new_zeros(*batch, block.shape[-2], n_up + n_yp + n_u + n_y)
-        theta[..., :n_up] = -block @ rows.Up_pinv
-        if target is not None:
-            start, matrix = target
-            theta[..., start : start + matrix.shape[-1]] = matrix
-        e.append(theta)
-    return torch.cat(E, dim=-2), torch.cat(e, dim=-2)
+        target = block.new_zeros(*batch, block.shape[-2], rows.n_theta)
+        if matrix is not None and start is not None:
+            target[..., start : start + matrix.shape[-1]] = matrix
+        target[..., rows.Eq_theta] -= block @ rows.Eq_pinv
+        f.append(target)
+    return torch.cat(E, dim=-2), torch.cat(f, dim=-2)
 
 
 def _factor(E: Tensor) -> tuple[Tensor, Tensor, bool]:
@@ -262,48 +174,53 @@ def _factor(E: Tensor) -> tuple[Tensor, Tensor, bool]:
     return T, Qe[..., :k, :], True
 
 
-def _outside_W(rows: DataRows) -> Tensor:
-    """M in the coordinates a: the identity on the entries beyond the rank of W."""
-    return _eye(rows.C.shape[-1], rows.C)[rows.rank_W :]
+def _charged(rows: DataRows) -> Tensor:
+    """M in the coordinates a, the identity on the entries beyond the rank of W; or all of the identity."""
+    if rows.charged.ndim == 1:
+        return torch.diag(rows.charged)[rows.charged.bool()]
+    return torch.diag_embed(rows.charged)
 
 
 def _with_graph(rows: DataRows, weights: Weights, T: Tensor, A_theta: Tensor, A_lam: Tensor) -> tuple[Tensor, Tensor]:
-    """Attach the derivative of [Psi Up'; Up 0] [a; mu] = [Phi theta - C' lam; u_ini] to its known solution."""
-    n_up = rows.Up.shape[0]
-    lambda_g, lambda_s = weights.lambda_g[..., None, None], weights.lambda_s[..., None, None]
-    RU, QY = weights.R @ rows.Uf, weights.Q @ rows.Yf
-    Psi = rows.Uf.mT @ RU + rows.Yf.mT @ QY + 2 * lambda_s * (rows.Yp.mT @ rows.Yp) + 2 * lambda_g * _M(rows)
+    """Attach the derivative of [Psi Eq'; Eq 0] [a; mu] = [Phi theta - C' lam; e] to its known solution."""
+    # Psi = sum of rows' weight rows, and Phi likewise towards what each term is to meet.
+    terms: list[tuple[Tensor, Tensor, int | None]] = []
+    for term in rows.tracking:
+        if (weight := getattr(weights, term.weight)) is not None:
+            block = rows.C[..., term.rows, :]
+            terms.append(((weight @ block).mT, block, term.reference))
+    for fit in rows.fits:
+        terms.append((2 * getattr(weights, fit.weight)[..., None, None] * fit.rows.mT, fit.rows, fit.measured))
+    Psi = 2 * weights.lambda_g[..., None, None] * _gram_of_charged(rows)
+    for weighted, block, _ in terms:
+        Psi = Psi + weighted @ block
     batch = Psi.shape[:-2]
-    none = Psi.new_zeros(*batch, Psi.shape[-1], n_up)
-    parts = [none, 2 * lambda_s * rows.Yp.mT, RU.mT, QY.mT, -rows.C.mT]
-    top = torch.cat([p.expand(*batch, *p.shape[-2:]) for p in parts], dim=-1)
-    bottom = top.new_zeros(n_up, top.shape[-1])
-    bottom[:, :n_up] = _eye(n_up, bottom)
+    Phi = Psi.new_zeros(*batch, Psi.shape[-1], rows.n_theta)
+    for weighted, _, start in terms:
+        if start is not None:
+            Phi = Phi + torch.nn.functional.pad(weighted, (start, rows.n_theta - start - weighted.shape[-1]))
+    top = torch.cat([Phi, -rows.C.mT.expand(*batch, -1, -1)], dim=-1)
+    n_eq = rows.Eq.shape[-2]
+    bottom = top.new_zeros(n_eq, top.shape[-1])
+    bottom[torch.arange(n_eq), rows.Eq_theta] = 1.0
     solution = torch.cat([A_theta, -A_lam], dim=-1)
-    saddle = Saddle(T=T, Z=rows.Z, Up_pinv=rows.Up_pinv)
-    solution = known_solution(Psi, rows.Up, top, bottom, solution.expand(*batch, -1, -1), saddle)
-    n_theta = A_theta.shape[-1]
-    return solution[..., :n_theta], -solution[..., n_theta:]
+    saddle = Saddle(T=T, Z=rows.Z, Eq_pinv=rows.Eq_pinv)
+    solution = known_solution(Psi, rows.Eq, top, bottom, solution.expand(*batch, -1, -1), saddle)
+    return solution[..., : rows.n_theta], -solution[..., rows.n_theta :]
 
 
-def _M(rows: DataRows) -> Tensor:
-    """M = I - W^+ W in the coordinates a, with its derivative at constant rank of W where the data carry a graph."""
-    M = _outside_W(rows)
-    M = M.mT @ M
-    W = torch.cat([rows.Up, rows.Yp, rows.Uf])
-    if not W.requires_grad:
+def _gram_of_charged(rows: DataRows) -> Tensor:
+    """M = I - W^+ W in the coordinates a (or I), with its derivative at constant rank of W where W has a graph."""
+    N = _charged(rows)
+    M = N.mT @ N
+    W = torch.cat([rows.Up, rows.Yp, rows.Uf], dim=-2)
+    if not W.requires_grad or rows.is_identity:
         return M
     with torch.no_grad():
         W_pinv = torch.linalg.pinv(W, rtol=1e-10)
     # M dW = 0 at the point itself, so the term below is 0 in value and -(W^+ dW M + M dW' W^+') in derivative.
     change = W_pinv @ (W - W.detach()) @ M
     return M - change - change.mT
-
-
-def psd_root(matrix: Tensor) -> Tensor:
-    """Return S with S'S = matrix, for a symmetric positive semidefinite matrix `(..., n, n)`."""
-    values, vectors = torch.linalg.eigh(matrix)
-    return values.clamp_min(0.0).sqrt()[..., None] * vectors.mT
 
 
 def _eye(n: int, like: Tensor) -> Tensor:

@@ -8,7 +8,7 @@ squares of the other entries of a.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import torch
@@ -55,6 +55,10 @@ class RowSpace:
         """Whether kept and dropped singular values are far apart, so that the rank is constant nearby."""
         return self.last_kept > self.CLEAR_GAP * self.first_dropped
 
+    def of_its_coordinates(self) -> RowSpace:
+        """Return the row space of the data written in this basis, with the same decision: the basis is the identity."""
+        return replace(self, basis=torch.eye(self.rank, dtype=self.basis.dtype, device=self.basis.device))
+
     @staticmethod
     def of(data: HankelData) -> RowSpace:
         """Factor the data once: QR of the columns, then two small SVDs that decide the ranks.
@@ -63,7 +67,7 @@ class RowSpace:
         judged against the largest singular value of the whole stacked matrix, the remainder of Yf included.
         """
         stacked = torch.cat([_to_unit_channels(m.detach().double(), n) for m, n in _with_channels(data)])
-        tolerance = relative_tolerance(data.Up.dtype)
+        tolerance = data.rank_tolerance
         columns, R = torch.linalg.qr(stacked.T)  # n_g enters here and nowhere else
         rows = R.T
         n_W = rows.shape[0] - data.Yf.shape[0]

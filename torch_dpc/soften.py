@@ -58,11 +58,15 @@ def _enough(layer: DPCLayer, theta: Tensor, weight: float) -> float:
 def _plan(layer: DPCLayer, theta: Tensor, widths: Tensor) -> DPCSolution:
     lower, upper = layer.bounds(theta.device)
     widened = torch.zeros_like(lower)
-    widened[layer.sizes.u :] = 1.0
+    widened[_outputs(layer)] = 1.0
     step = widths[:, None] * widened
     return layer.plan(theta.expand(len(widths), -1), lower - step, upper + step, on_failure="nan")
 
 
 def _is_worth(plan: DPCSolution, layer: DPCLayer, weight: float) -> Tensor:
-    price = plan.lam[:, layer.sizes.u :].abs().sum(dim=1)
+    price = plan.lam[:, _outputs(layer)].abs().sum(dim=1)
     return (plan.info.status == Status.SOLVED) & (price <= weight)
+
+
+def _outputs(layer: DPCLayer) -> slice:
+    return slice(layer.sizes.u, layer.sizes.u + layer.sizes.y)

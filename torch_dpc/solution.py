@@ -8,6 +8,8 @@ from functools import cached_property
 
 from torch import Tensor
 
+from .errors import Status
+
 
 class SolveInfo:
     """How the solve of each sample went; every tensor has the batch's shape.
@@ -16,9 +18,10 @@ class SolveInfo:
         is_selection: the cost does not fix g; u, y and g are those of the minimum-norm g.
     """
 
-    def __init__(self, table: Tensor, is_selection: bool):
+    def __init__(self, table: Tensor, is_selection: bool, make_nonsingular: Callable[[], Tensor]):
         self.table = table
         self.is_selection = is_selection
+        self._make_nonsingular = make_nonsingular
 
     @property
     def status(self) -> Tensor:
@@ -44,6 +47,15 @@ class SolveInfo:
     def n_weakly_active(self) -> Tensor:
         """Rows that touch their bound without a multiplier, int64; derivatives treat them as free."""
         return self.table[..., 4].long()
+
+    @cached_property
+    def nonsingular(self) -> Tensor:
+        """Whether the paper's J is nonsingular at the solution, boolean: Proposition 1 holds as it stands.
+
+        Where it is not, some multipliers or g are one choice of many, and derivatives are those of minimum norm.
+        Computed when first asked for.
+        """
+        return self._make_nonsingular() & (self.status == Status.SOLVED)
 
     def __repr__(self) -> str:
         names = ("status", "iterations", "residual", "n_active", "n_weakly_active", "is_selection")
@@ -74,5 +86,5 @@ class DPCSolution:
 
     def sample(self, i: int) -> DPCSolution:
         """Return one sample of a batch."""
-        info = SolveInfo(self.info.table[i], self.info.is_selection)
+        info = SolveInfo(self.info.table[i], self.info.is_selection, lambda: self.info.nonsingular[i])
         return DPCSolution(self.u[i], self.y[i], info, self.lam[i], lambda: self.g[i])

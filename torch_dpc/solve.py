@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -12,6 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from . import kernels
+from .active_set import solve_active
 from .checks import as_data, is_finite
 from .dual_active_set import SOLVED_FLAG, Daqp, sense_of, solve_daqp
 from .errors import InfeasibleError, SolveError, Status
@@ -25,11 +26,11 @@ from .reduction import Reduction
 
 #: A sample is accepted when F, relative to its own terms, is at most this.
 ACCEPTED = 1e-8
-#: DAQP's own multipliers are taken as they are up to this residual, and polished above it.
+#: One sample's multipliers are taken as they are up to this residual; above it the batched way has its turn.
 AS_GOOD_AS_POLISHED = 1e-11
-#: Up to this many samples on the CPU, NumPy and DAQP take one after the other.
+#: Up to this many samples on the CPU, NumPy takes one after the other.
 FEW = 3
-#: On the CPU, DAQP takes batches up to this size and Newton larger ones.
+#: Without the compiled kernels, DAQP takes batches up to this size on the CPU and Newton larger ones.
 DAQP_BATCH = 16
 
 Engine = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], ActiveSetResult]
@@ -93,6 +94,11 @@ class Solver:
         return Optimality(self.reduction, SINGLE)
 
     @cached_property
+    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """A_theta, C and G of one problem on the CPU."""
+        return self.reduction.A_theta.numpy(), self.reduction.rows.C.numpy(), self.reduction.G.contiguous().numpy()
+
+    @cached_property
     def _daqp(self) -> Daqp | None:
         return Daqp(self.reduction.Ct) if self.reduction.Ct.ndim == 2 else None
 
@@ -114,21 +120,28 @@ class Solver:
             InfeasibleError, SolveError: with `on_failure="raise"`, if a sample has no accepted solution.
         """
         daqp_first = self._is_daqp_first(theta)
-        if daqp_first and self._are_few(theta, lower, upper):
-            samples = theta.numpy().reshape(-1, theta.shape[-1])
-            quick = self._one_by_one(samples, lower.numpy(), upper.numpy(), theta.shape[:-1])
+        if theta.numel() <= FEW * theta.shape[-1]:
+            quick = self._one_by_one(theta, lower, upper, daqp_first)
             if quick is not None:
                 return quick
         shared_bounds = lower.ndim == upper.ndim == 1
         vectors = (theta,) if shared_bounds else (theta, lower, upper)
         batch, _, (samples, *bounds) = flatten_batch((self.reduction.G,), vectors)
-        self._check_finite(samples)
+        check_finite(samples, self.sizes)
         lower, upper = bounds if bounds else (lower, upper)
         one_each = self if self.reduction.G.ndim == 2 else replace(self, reduction=self.reduction.of_batch(batch))
         solved = one_each._solve(samples, lower, upper, daqp_first)
-        self._report(solved, batch)
+        report_failures(solved.info, batch, self.on_failure)
         v, *rest = (x.reshape(*batch, x.shape[-1]) for x in solved)
         return Planned(*self.sizes.split(v), *rest)
+
+    def independent(self, theta: Tensor, planned: Planned) -> Tensor:
+        """Return whether the rows held at a bound are independent, `(*batch,)`."""
+        batch, _, (active,) = flatten_batch((self.reduction.G,), (planned.active,))
+        one_each = self.reduction.of_batch(batch)
+        return solve_active(one_each.G, one_each.Ct, active, torch.zeros_like(active, dtype=torch.float64))[1].reshape(
+            batch
+        )
 
     def _solve(self, theta: Tensor, lower: Tensor, upper: Tensor, daqp_first: bool) -> Solved:
         """Run the first engine on the batch, the second on what it left."""
@@ -144,23 +157,12 @@ class Solver:
             subset._mark_failures(solved, rest, *problem)
         return solved
 
-    def _check_finite(self, theta: Tensor) -> None:
-        if is_finite(theta):
-            return
-        for name, part in zip(("u_ini", "y_ini", "u_ref", "y_ref"), theta.split(self.sizes.theta, dim=-1), strict=True):
-            as_data(name, part)
-
     def _is_daqp_first(self, theta: Tensor) -> bool:
-        """DAQP is faster for a few problems with one matrix, Newton for many; `scripts/benchmark.py` shows where."""
-        count = theta.numel() // theta.shape[-1]
-        suits = theta.device.type == "cpu" and count <= DAQP_BATCH and self._daqp is not None
-        return self.engine == "daqp" or (self.engine == "auto" and suits)
-
-    def _are_few(self, theta: Tensor, lower: Tensor, upper: Tensor) -> bool:
-        """Whether NumPy can take the samples one by one: few, on the CPU, and nothing to look at sample by sample."""
-        shared = lower.ndim == upper.ndim == 1 and self.reduction.rows.u_ini_range is None
-        few = theta.numel() <= FEW * theta.shape[-1] and theta.device.type == "cpu"
-        return shared and few and math.isfinite(theta.numpy().sum())
+        """Newton is faster, but without its kernel for a few problems with one matrix."""
+        if self.engine != "auto":
+            return self.engine == "daqp"
+        few = theta.device.type == "cpu" and theta.numel() <= DAQP_BATCH * theta.shape[-1]
+        return few and self._daqp is not None and not kernels.serve(theta)
 
     def _engine(self, daqp: bool) -> Engine:
         return partial(solve_daqp, workspace=self._daqp) if daqp else solve_newton
@@ -174,36 +176,43 @@ class Solver:
         info = [failed * Status.FAILED, found.iterations, judged.residual, judged.n_active, judged.n_weakly_active]
         return Solved(judged.v, found.lam, judged.active, torch.stack([i.double() for i in info], dim=-1))
 
-    def _one_by_one(
-        self, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray, batch: tuple[int, ...]
-    ) -> Planned | None:
-        """Run DAQP and judge its own multipliers, in NumPy; None if one sample does not convince."""
-        sense = sense_of(lower == upper)
-        found = []
-        for sample in theta:
-            one = self._one(sample, lower, upper, sense)
+    def _one_by_one(self, theta: Tensor, lower: Tensor, upper: Tensor, daqp_first: bool) -> Planned | None:
+        """Solve and judge the samples in NumPy; None where that does not do, or one of them does not convince.
+
+        A value that is not finite does not: the engines flag what comes of it, and the batched way says its name.
+        """
+        if theta.device.type != "cpu" or not (daqp_first or kernels.serve(theta)):
+            return None
+        plain = lower.ndim == upper.ndim == 1 and self.reduction.G.ndim == 2 and self.reduction.rows.Eq_range is None
+        batch, sample = theta.shape[:-1], theta.numpy()
+        if not plain:
+            return None
+        bounds = lower.numpy(), upper.numpy()
+        if not batch:
+            one = self._one(sample, *bounds, daqp_first)
             if one is None:
                 return None
-            found.append(one)
-        if not batch:
-            v, *rest = found[0]
-        elif found:
-            v, *rest = (np.stack(x).reshape((*batch, -1)) for x in zip(*found, strict=True))
+            v, *rest = one
         else:
-            return None
-        u, y = self.sizes.split(v)
-        return Planned(*map(torch.from_numpy, (u, y, *rest)))
+            several = [self._one(row, *bounds, daqp_first) for row in sample.reshape(-1, sample.shape[-1])]
+            found = [one for one in several if one is not None]
+            if not found or len(found) < len(several):
+                return None
+            v, *rest = (np.stack(x).reshape((*batch, -1)) for x in zip(*found, strict=True))
+        return Planned(*map(torch.from_numpy, (*self.sizes.split(v), *rest)))
 
     def _one(
-        self, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray, sense: np.ndarray
+        self, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray, daqp_first: bool
     ) -> tuple[np.ndarray, ...] | None:
-        """Return v, lam, active and info of one sample, as `Solved` describes them."""
-        if self._daqp is None:
-            return None
+        """Return v, lam, active and info of one sample, as `Solved` describes them; None if they do not convince."""
         a0, v0 = self._single.unconstrained(theta)
-        lam, flag, iterations = self._daqp.solve(lower - v0, upper - v0, sense)
+        if daqp_first and self._daqp is not None:
+            lam, flag, iterations = self._daqp.solve(lower - v0, upper - v0, sense_of(lower == upper))
+            solved = flag == SOLVED_FLAG
+        else:
+            (lam,), (iterations,), (solved,) = kernels.solve_boxes(self.arrays[2], v0[None], lower, upper)
         v, residual, active, n_active, n_weak = self._single.judge(theta, a0, v0, lam, lower, upper)
-        if not (flag == SOLVED_FLAG and residual <= AS_GOOD_AS_POLISHED):  # NaN is not either
+        if not (solved and residual <= AS_GOOD_AS_POLISHED):  # NaN is not either
             return None
         return v, lam, active, np.array((Status.SOLVED, iterations, residual, n_active, n_weak), dtype=np.float64)
 
@@ -221,23 +230,33 @@ class Solver:
             for emptied in (solved.lam[i], solved.active[i], solved.info[i, 3:]):
                 emptied.zero_()
 
-    def _report(self, solved: Solved, batch: torch.Size) -> None:
-        failed = solved.failed.nonzero()[:, 0]
-        if self.on_failure == "nan" or len(failed) == 0:
-            return
-        infeasible = (solved.info[failed, 0] == Status.INFEASIBLE).tolist()
-        places = [tuple(int(j) for j in torch.unravel_index(i, batch)) if batch else () for i in failed]
-        where = f"batch {'index' if len(places) == 1 else 'indices'} {_listed(places)}" if batch else "the problem"
-        hint = 'on_failure="nan" marks such samples and returns the others.'
-        if all(infeasible):
-            why = "no trajectory meets the constraints (the data cannot produce u_ini, or the bounds exclude all)"
-            raise InfeasibleError(f"{where}: {why}. {hint}", places)
-        worst = float(solved.info[failed, 2].max())
-        raise SolveError(
-            f"{where}: no engine reached a residual of {ACCEPTED:g} (got {worst:.1e}), and {sum(infeasible)} of "
-            f"{len(places)} are proven infeasible. Badly scaled data or weights are the usual reason. {hint}",
-            places,
-        )
+
+def check_finite(theta: Tensor, sizes: Sizes) -> None:
+    """Raise ValueError, naming the part of theta that holds it, at a value that is not finite."""
+    if is_finite(theta):
+        return
+    for name, part in zip(("u_ini", "y_ini", "u_ref", "y_ref"), theta.split(sizes.theta, dim=-1), strict=True):
+        as_data(name, part)
+
+
+def report_failures(info: Tensor, batch: torch.Size, on_failure: str) -> None:
+    """Raise what the samples without a solution call for, given the info table `(B, 5)`."""
+    failed = (info[:, 0] != Status.SOLVED).nonzero()[:, 0]
+    if on_failure == "nan" or len(failed) == 0:
+        return
+    infeasible = (info[failed, 0] == Status.INFEASIBLE).tolist()
+    places = [tuple(int(j) for j in torch.unravel_index(i, batch)) if batch else () for i in failed]
+    where = f"batch {'index' if len(places) == 1 else 'indices'} {_listed(places)}" if batch else "the problem"
+    hint = 'on_failure="nan" marks such samples and returns the others.'
+    if all(infeasible):
+        why = "no trajectory meets the constraints (the data cannot produce u_ini, or the bounds exclude all)"
+        raise InfeasibleError(f"{where}: {why}. {hint}", places)
+    worst = float(info[failed, 2].max())
+    raise SolveError(
+        f"{where}: no engine reached a residual of {ACCEPTED:g} (got {worst:.1e}), and {sum(infeasible)} of "
+        f"{len(places)} are proven infeasible. Badly scaled data or weights are the usual reason. {hint}",
+        places,
+    )
 
 
 def _listed(places: list[tuple[int, ...]], most: int = 10) -> str:

@@ -12,11 +12,23 @@ from torch.autograd import forward_ad
 _functorch = getattr(torch._C, "_functorch", None)
 _is_wrapped = getattr(_functorch, "is_functorch_wrapped_tensor", lambda tensor: True)
 _is_legacy_batched = getattr(_functorch, "is_legacy_batchedtensor", lambda tensor: False)
+_are_transforms_active = getattr(torch._C, "_are_functorch_transforms_active", lambda: True)
 
 
 def is_plain(tensor: Tensor) -> bool:
     """Return whether a tensor holds its own numbers: no `vmap` or `torch.func` transform has wrapped it."""
     return type(tensor) is Tensor and not _is_wrapped(tensor) and not _is_legacy_batched(tensor)
+
+
+def apply_function(function: type[torch.autograd.Function], *args: Any) -> Any:
+    """Return `function.apply(*args)`.
+
+    `Function.apply` binds the arguments by name and looks for wrappers that transforms left behind, which takes longer
+    than the rest of a small Function. Where no transform is at work and nothing is wrapped, what it then calls will do.
+    """
+    if _are_transforms_active() or not all(is_plain(arg) for arg in args if isinstance(arg, Tensor)):
+        return function.apply(*args)
+    return super(torch.autograd.Function, function).apply(*args)  # type: ignore[misc]
 
 
 def is_grads_batched(tensor: Tensor) -> bool:

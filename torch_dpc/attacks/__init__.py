@@ -1,11 +1,13 @@
 """Attacks on the measurements: costs, budgets, and how to choose a perturbation."""
 
-from .budgets import Ball, Box, Budget, Ellipsoid, RelativeBall
-from .costs import Cost, TargetInput
+from .budgets import Ball, Box, Budget, Ellipsoid, L1Ball, PerChannel, RelativeBall, SparseBall
+from .costs import Cost, TargetInput, TrackingError
 from .gradient import LinearizedAttack
 from .iterative import FrankWolfeAttack, ProjectedGradientAttack
 from .network import AttackPolicy
 from .policy import PolicyAttack
+from .predictor import Predictor
+from .query import FiniteDifferenceAttack, RandomSearchAttack
 from .random import RandomAttack
 
 __all__ = [
@@ -15,11 +17,18 @@ __all__ = [
     "Budget",
     "Cost",
     "Ellipsoid",
+    "FiniteDifferenceAttack",
     "FrankWolfeAttack",
+    "L1Ball",
     "LinearizedAttack",
+    "PerChannel",
     "PolicyAttack",
+    "Predictor",
     "ProjectedGradientAttack",
     "RandomAttack",
+    "RandomSearchAttack",
     "RelativeBall",
+    "SparseBall",
     "TargetInput",
+    "TrackingError",
 ]

@@ -1,4 +1,9 @@
-"""What an attacker wants: costs psi of the planned trajectory, to be made small."""
+"""What an attacker wants: costs psi of the planned trajectory, to be made small.
+
+A cost is any callable DPCSolution -> `(*batch,)`. Two optional methods let it know more than the plan: `at(step)`
+returns the cost of a plan made at a step of the run, and `given(u_ini=..., y_ini=..., y_ref=..., u_ref=...)` the cost
+of a plan made when the unattacked window and the references are these. Every attack asks for both, once a call.
+"""
 
 from __future__ import annotations
 
@@ -9,17 +14,25 @@ import torch
 from torch import Tensor
 
 from ..checks import as_data
+from ..hankel import HankelData
 from ..solution import DPCSolution
+from ..weights import weight_matrix
+from .predictor import Predictor
+from .references import last_rows, to_horizon
 
 #: A cost of a plan, `(*batch,)`; any callable will do.
 Cost = Callable[[DPCSolution], Tensor]
+
+#: Where the predicted outputs follow the reference to this fraction of their size, the difference is rounding.
+FOLLOWED = 1e-10
 
 
 class TargetInput:
     """psi(u) = 1/2 |u - u_target|^2: make the controller apply the attacker's input (the paper's cost).
 
     Args:
-        u_target: `(n_u,)` or `(horizon, n_u)`, in the units of the inputs.
+        u_target: `(n_u,)` or `(horizon, n_u)`, in the units of the inputs. Where a plan has another horizon, the rows
+            are cut, or the last one held.
         trajectory: instead, a target for the whole run, `(>= steps, n_u)`: the plan of step k is compared with its rows
             k, ..., k + horizon - 1, the last row held beyond its end.
     """
@@ -39,8 +52,8 @@ class TargetInput:
         def psi(solution: DPCSolution) -> Tensor:
             target = self.target.to(solution.u)
             if self.moves:
-                rows = torch.arange(step, step + solution.u.shape[-2], device=target.device)
-                target = target[rows.clamp_max(len(target) - 1)]
+                target = target[min(step, len(target) - 1) :]
+            target = to_horizon(target, solution.u.shape[-2])
             return 0.5 * (solution.u - target).square().sum((-2, -1))
 
         return psi
@@ -50,6 +63,62 @@ class TargetInput:
         return self.at(0)(solution)
 
 
+class TrackingError:
+    """psi = -1/2 |y_true - y_ref|_Q^2: drive the true output away from its reference.
+
+    The plan's own y is what the controller was made to believe. y_true is what its inputs will do: the output that the
+    data predict for u* from the *unattacked* window (:class:`torch_dpc.attacks.Predictor`). Where that follows the
+    reference to 1e-10 the error counts as none: psi has its maximum there and no direction leads down, so the attack of
+    one step is zero; give attacks `restarts=`.
+
+    Args:
+        data: the recording that predicts, usually `layer.data`.
+        Q: output weight, as the layer takes it.
+
+    Example:
+        >>> import torch_dpc as dpc
+        >>> plant, generator = dpc.systems.OscillatingMasses(), torch.Generator().manual_seed(0)
+        >>> u, y = dpc.collect(plant, 120, generator=generator)
+        >>> data = dpc.HankelData.from_trajectories(u, y, t_ini=4, horizon=10)
+        >>> layer = dpc.DPCLayer(data, Q=10.0, R=1.0, lambda_g=1.0, lambda_s=1e4)
+        >>> attack = dpc.attacks.LinearizedAttack(layer, TrackingError(data, Q=10.0), dpc.attacks.RelativeBall(0.01))
+        >>> attack(u[:4], y[:4], y_ref=torch.ones(4)).shape
+        torch.Size([4, 4])
+    """
+
+    def __init__(self, data: HankelData, Q: Any = 1.0):
+        self.predictor = Predictor(data)
+        self.Q = weight_matrix("Q", Q, data.n_y, data.horizon)
+
+    def given(self, *, u_ini: Tensor, y_ini: Tensor, y_ref: Any = None, u_ref: Any = None) -> Cost:
+        """Return the cost of a plan made from a window that is truly (u_ini, y_ini), under this reference."""
+        t_ini, horizon = self.predictor.t_ini, self.predictor.horizon
+        u_ini, y_ini = last_rows(u_ini, t_ini), last_rows(y_ini, t_ini)
+        reference = torch.zeros(()) if y_ref is None else to_horizon(as_data("y_ref", y_ref), horizon)
+
+        def psi(solution: DPCSolution) -> Tensor:
+            y_true = self.predictor(u_ini, y_ini, solution.u)
+            wanted = reference.to(y_true).expand_as(y_true)
+            scale = torch.maximum(y_true.detach().abs(), wanted.abs()).amax((-2, -1), keepdim=True)
+            error = y_true - wanted
+            error = torch.where(error.abs() > FOLLOWED * scale, error, 0.0).flatten(-2)
+            return -0.5 * (error * (error @ self.Q.to(error))).sum(-1)
+
+        return psi
+
+    def __call__(self, solution: DPCSolution) -> Tensor:
+        """Refuse: a plan alone does not say where the system is."""
+        raise ValueError(
+            "`TrackingError` needs the unattacked window: call cost.given(u_ini=..., y_ini=..., y_ref=...)."
+        )
+
+
 def at_step(cost: Any, step: int) -> Cost:
     """Return the cost of a plan made at a step; a cost without `at` is the same at every step."""
     return cost.at(step) if hasattr(cost, "at") else cost
+
+
+def bound(cost: Any, step: int, u_ini: Tensor, y_ini: Tensor, y_ref: Any = None, u_ref: Any = None) -> Cost:
+    """Return the cost of a plan made at a step, from this unattacked window and for these references."""
+    cost = at_step(cost, step)
+    return cost.given(u_ini=u_ini, y_ini=y_ini, y_ref=y_ref, u_ref=u_ref) if hasattr(cost, "given") else cost

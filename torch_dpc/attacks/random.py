@@ -9,6 +9,7 @@ from torch import Tensor
 
 from ..checks import as_data
 from .budgets import Budget
+from .objective import checked
 
 
 class RandomAttack:
@@ -32,4 +33,5 @@ class RandomAttack:
         step: int = 0,
     ) -> Tensor:
         """Return p, the shape of y_ini; the call of every attack."""
-        return self.budget.random(as_data("y_ini", y_ini), generator)
+        y_ini = as_data("y_ini", y_ini)
+        return checked(self.budget.random(y_ini, generator), y_ini, self.budget)

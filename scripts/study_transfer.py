@@ -1,0 +1,215 @@
+"""Study: how much of an attack survives when the attacker does not know the controller; beyond the paper.
+
+    python scripts/study_transfer.py            # about 2 minutes on two cores
+    python scripts/study_transfer.py --quick    # about 20 s: one seed, fewer windows
+
+The settings of Figures 3 and 4 at their largest rho. The attacker plans p on a surrogate, a layer with other data,
+weights or horizon than the controller's, or asks the controller itself for its inputs, so many windows at a time. What
+counts is the controller's answer: the decrease of psi on windows of a recording that neither has seen, as a share of
+that of Algorithm 1 with full knowledge, and on the masses the tracking error in closed loop. Every seed has a
+controller, an attacker's recording and held-out windows of its own. Leaves, in results/:
+
+    transfer.csv    one row for each plant, seed and attack
+    transfer.png    shares: the mean over the seeds and their range
+    transfer.md     the same as tables
+"""
+
+from __future__ import annotations
+
+import re
+import time
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+import torch_dpc as dpc
+from _common import ATTACK_SEED, Array, Rows, arguments, read_rows, run_all, versions, write_rows
+from _plots import plt, style
+from _surrogates import SURROGATES, Plant, load, surrogate
+
+SEEDS, QUICK_SEEDS = 5, 1
+WINDOW_EVERY, QUICK_EVERY = 12, 48  # steps between held-out windows
+PLANTS = ("masses", "quadrotor")
+ONE_STEP, MORE_STEPS = "Algorithm 1", "projected gradient"
+FULL, RANDOM = "everything", "nothing: random noise"
+SEARCHES = (20, 100, 500)  # queries a window
+DIRECTIONS = 10
+TITLES = {"masses": "Oscillating masses", "quadrotor": "Quadrotor"}
+HEAD = """# How much of an attack survives partial knowledge
+
+Shares of what Algorithm 1 with full knowledge does: of its decrease of psi on held-out windows, and on the masses of
+its mean tracking error in closed loop. Mean over the seeds, in brackets the extremes. The attacker plans on a surrogate
+that differs from the controller as the line says, or knows nothing and asks the controller for its inputs. Noise is
+relative to the spread of each output; with all of it off the surrogate has another recording with 1 % of noise, horizon
+20, lambda_s / 10, lambda_g x 10 and Q / 2. The cosine is that between the attacker's p, of one step, and Algorithm 1's
+with full knowledge."""
+
+
+def attackers(plant: Plant, victim: dpc.DPCLayer, seed: int) -> Iterator[tuple[str, str, str, Any]]:
+    """Yield the kind of knowledge, what is known, the method, and the attack."""
+    budget = dpc.attacks.RelativeBall(plant.rho)
+    for knows, changes in SURROGATES.items():
+        problem = (surrogate(plant, seed=seed, **changes), plant.cost, budget)
+        yield "surrogate", knows, ONE_STEP, dpc.attacks.LinearizedAttack(*problem)
+        yield "surrogate", knows, MORE_STEPS, dpc.attacks.ProjectedGradientAttack(*problem)
+    yield "none", RANDOM, RANDOM, dpc.attacks.RandomAttack(budget)
+    problem = (victim, plant.cost, budget)
+    rough = dpc.attacks.FiniteDifferenceAttack(*problem, directions=DIRECTIONS)
+    yield "queries", f"differences along {DIRECTIONS} random directions", "differences", rough
+    yield "queries", "differences of every entry", "differences", dpc.attacks.FiniteDifferenceAttack(*problem)
+    for queries in SEARCHES:
+        attack = dpc.attacks.RandomSearchAttack(*problem, queries=queries)
+        yield "queries", f"random search, {queries} queries", "search", attack
+
+
+def run_seed(name: str, seed: int, every: int) -> list[dict[str, Any]]:
+    """Return one row for every attack of one seed on one plant."""
+    plant = load(name, seed, every)
+    victim = surrogate(plant)
+    u_ini, y_ini = plant.windows
+    cost = plant.cost.at(0)
+    nominal = cost(victim(u_ini, y_ini, **plant.refs))
+    rows, full_p = [], None
+    for kind, knows, method, attack in attackers(plant, victim, seed):
+        generator = torch.Generator().manual_seed(ATTACK_SEED + seed)
+        p = attack(u_ini, y_ini, **plant.refs, generator=generator)
+        full_p = p if full_p is None else full_p
+        cosine = float(torch.nn.functional.cosine_similarity(p.flatten(1), full_p.flatten(1)).mean())
+        plan = victim(u_ini, y_ini + p, **plant.refs, on_failure="nan")
+        solved = plan.info.status == dpc.Status.SOLVED
+        decrease = float((nominal - cost(plan))[solved].mean())
+        queries = getattr(attack, "n_queries", 0) / len(u_ini)
+        in_closed_loop = name == "masses" and (method != MORE_STEPS or knows == FULL)
+        error = closed_loop_error(plant, victim, attack, seed) if in_closed_loop else np.nan
+        row = {"plant": name, "seed": seed, "kind": kind, "knows": knows, "method": method, "queries": queries}
+        row["cosine"] = cosine  # with what Algorithm 1 does with full knowledge, the first of all
+        row |= {"psi": float(nominal.mean()), "decrease": decrease, "unsolved": int((~solved).sum()), "error": error}
+        rows.append(row)
+    full = next(row for row in rows if (row["knows"], row["method"]) == (FULL, ONE_STEP))
+    shares = (("share", "decrease"), ("error_share", "error"))
+    return [row | {share: row[of] / full[of] for share, of in shares} for row in rows]
+
+
+def closed_loop_error(plant: Plant, victim: dpc.DPCLayer, attack: Any, seed: int) -> float:
+    """Return the mean error of the first mass in a run of Figure 3 [m]; without an attack it is 0."""
+    s = plant.settings
+    log = dpc.simulate(
+        dpc.systems.OscillatingMasses(),
+        dpc.DPCController(victim, s.REPLAN_EVERY, on_failure="hold"),
+        s.Y_REF,
+        steps=s.STEPS,
+        u_ref=s.U_REF,
+        attack=attack,
+        generator=torch.Generator().manual_seed(ATTACK_SEED + seed),
+        reset={"state": s.Y_REF},
+        u_warmup=s.U_REF,
+    )
+    return float((log.y[:, 0] - s.Y_REF[0]).abs().mean())
+
+
+def pick(rows: Rows, plant: str, knows: str, method: str, column: str) -> Array:
+    """Return a column over the seeds."""
+    chosen = (rows["plant"] == plant) & (rows["knows"] == knows) & (rows["method"] == method)
+    return rows[column][chosen]
+
+
+def cases(rows: Rows, plant: str) -> list[tuple[str, str, list[str]]]:
+    """Return the kind, the knowledge and the methods of every line of a table or plot, in order."""
+    seen: dict[str, tuple[str, list[str]]] = {}
+    for kind, knows, method in zip(rows["kind"], rows["knows"], rows["method"], strict=True):
+        methods = seen.setdefault(knows, (kind, []))[1]
+        if method not in methods:
+            methods.append(method)
+    return [(kind, knows, methods) for knows, (kind, methods) in seen.items()]
+
+
+def share(values: Array) -> str:
+    """Return the mean over the seeds in percent and, in brackets, the extremes."""
+    if not np.isfinite(values).all():
+        return "-"
+    mean, low, high = (round(100 * float(value)) for value in (values.mean(), values.min(), values.max()))
+    return f"{mean} % ({low} to {high})"
+
+
+def table(rows: Rows, plant: str) -> list[str]:
+    """Return the lines of one plant's table."""
+    psi, decrease, error = (pick(rows, plant, FULL, ONE_STEP, column).mean() for column in ("psi", "decrease", "error"))
+    has_error = bool(np.isfinite(error))
+    text = f"Without an attack psi is {psi:.3g}; Algorithm 1 takes {decrease:.3g} from it"
+    text += f", and leaves a mean error of {error:.3g} m in closed loop." if has_error else "."
+    head = ["the attacker has", "queries a window", "cosine", "psi: one step or search", "psi: projected gradient"]
+    head += ["error in closed loop, one step or search"] * has_error
+    lines = [f"## {TITLES[plant]}", "", text, "", "| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
+    for _, knows, methods in cases(rows, plant):
+        first = methods[0]
+        cells = [knows, f"{pick(rows, plant, knows, first, 'queries').mean():.0f}"]
+        cells += [f"{pick(rows, plant, knows, first, 'cosine').mean():.2f}"]
+        cells += [share(pick(rows, plant, knows, first, "share"))]
+        cells += [share(pick(rows, plant, knows, MORE_STEPS, "share")) if MORE_STEPS in methods else "-"]
+        cells += [share(pick(rows, plant, knows, first, "error_share"))] * has_error
+        lines.append("| " + " | ".join(cells) + " |")
+    if has_error:
+        more = share(pick(rows, plant, FULL, MORE_STEPS, "error_share"))
+        lines += ["", f"In closed loop projected gradient with full knowledge makes {more} of Algorithm 1's error."]
+    return [*lines, "", f"Windows without a plan, left out: {int(rows['unsolved'][rows['plant'] == plant].sum())}."]
+
+
+def plot(path: Path, rows: Rows) -> None:
+    """Draw the shares, one panel a plant, one line a kind of knowledge."""
+    style()
+    lines = cases(rows, PLANTS[0])
+    figure, panels = plt.subplots(1, 2, figsize=(8.4, 8.0), sharey=True, width_ratios=(1.2, 1))
+    looks = {"psi, one step or search": ("o", "#d55e00"), "psi, projected gradient": ("s", "#35178c")}
+    looks["error in closed loop"] = ("D", "#0072b2")
+    for axes, plant in zip(panels, PLANTS, strict=True):
+        for place, (_, knows, methods) in enumerate(lines):
+            drawn = [(methods[0], "share", -0.25), (MORE_STEPS, "share", 0.0), (methods[0], "error_share", 0.25)]
+            for (method, column, shift), (marker, colour) in zip(drawn, looks.values(), strict=True):
+                values = 100 * pick(rows, plant, knows, method, column)
+                if len(values) and np.isfinite(values).all():
+                    axes.hlines(place + shift, values.min(), values.max(), color=colour, linewidth=1.2, alpha=0.6)
+                    axes.plot(values.mean(), place + shift, marker, color=colour, markersize=4)
+        axes.axvline(100, color="black", linewidth=0.8, linestyle=(0, (4, 2)))
+        axes.axvline(0, color="black", linewidth=0.8)
+        axes.set_title(TITLES[plant])
+    kinds = [kind for kind, *_ in lines]
+    for place in range(1, len(kinds)):
+        if kinds[place] != kinds[place - 1]:
+            for axes in panels:
+                axes.axhline(place - 0.5, color="black", linewidth=0.5)
+    names = [knows.replace("lambda", r"$\lambda$").replace(" x ", " × ") for _, knows, _ in lines]
+    panels[0].set_yticks(range(len(lines)), [re.sub(r"\$_(\w)", r"_\1$", name) for name in names])
+    figure.supxlabel("share of what Algorithm 1 does with full knowledge [%]", fontsize=10)
+    panels[0].set_ylim(len(lines) - 0.5, -0.5)
+    for name, (marker, colour) in looks.items():
+        panels[0].plot([], [], marker, color=colour, markersize=4, label=name)
+    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
+    figure.savefig(path)
+    plt.close(figure)
+
+
+def main(argv: list[str] | None = None) -> None:
+    parser = arguments(__doc__, seeds=SEEDS)
+    parser.add_argument("--quick", action="store_true", help="one seed and a quarter of the windows")
+    args = parser.parse_args(argv)
+    out: Path = args.out
+    out.mkdir(parents=True, exist_ok=True)
+    seeds, every = (QUICK_SEEDS, QUICK_EVERY) if args.quick else (args.seeds, WINDOW_EVERY)
+    began, note = time.perf_counter(), versions(seeds, args.workers)
+
+    jobs = [(plant, seed, every) for plant in PLANTS for seed in range(seeds)]
+    runs = run_all(run_seed, jobs, args.workers, "Transfer")
+    write_rows(out / "transfer.csv", (row for job in runs for row in job), note)
+
+    rows = read_rows(out / "transfer.csv")
+    plot(out / "transfer.png", rows)
+    body = [line for plant in PLANTS for line in ("", *table(rows, plant))]
+    (out / "transfer.md").write_text("\n".join([HEAD, "", f"{note}.", *body]) + "\n")
+    print(f"Transfer: {out / 'transfer.md'}, {time.perf_counter() - began:.0f} s")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,13 @@
+"""The one thing setup.cfg cannot say: the kernels in C, which torch_dpc works without, slower."""
+
+from setuptools import Extension, setup
+
+kernels = Extension(
+    "torch_dpc._kernels",
+    ["torch_dpc/_kernels.c"],
+    depends=["torch_dpc/_system.h", "torch_dpc/_boxes.h", "torch_dpc/_batch.h"],
+    extra_compile_args=["-O3", "-Wno-psabi"],  # vectors are passed between inlined functions alone
+    optional=True,
+)
+
+setup(ext_modules=[kernels])

@@ -1,0 +1,95 @@
+"""Budgets with a size of their own for every channel or entry: the box and the ellipsoid."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .budget_base import Budget, direction, euclidean, nonnegative, ratio
+
+
+class Box(Budget):
+    """|p_ti| <= radius for every entry: the maximum norm.
+
+    Args:
+        radius: a number, or one a channel, `(n_y,)`, or one an entry, `(t_ini, n_y)`, in the units of the outputs.
+        relative: |p_ti| <= radius max |y_ini| instead, the maximum over the entries that share the radius: all of them,
+            or those of the channel, or the entry itself.
+    """
+
+    def __init__(self, radius: Any, *, relative: bool = False):
+        self.radius = _sizes("radius", radius)
+        self.relative = relative
+
+    def minimize_linear(self, c: Tensor, y_ini: Tensor) -> Tensor:
+        return -self._reach(y_ini) * c.sign()
+
+    def project(self, p: Tensor, y_ini: Tensor) -> Tensor:
+        reach = self._reach(y_ini)
+        return torch.minimum(torch.maximum(p, -reach), reach)
+
+    def excess(self, p: Tensor, y_ini: Tensor) -> Tensor:
+        return ratio(p.abs(), self._reach(y_ini)).amax((-2, -1)) - 1
+
+    def _reach(self, y_ini: Tensor) -> Tensor:
+        radius = self.radius.to(y_ini)
+        if not self.relative:
+            return radius
+        dims = _shared(radius)
+        return radius * (y_ini.abs().amax(dims, keepdim=True) if dims else y_ini.abs())
+
+
+class Ellipsoid(Budget):
+    """sum (p_ti / scale_ti)^2 <= 1: the scale is the reach along each axis; an axis with scale 0 cannot be touched.
+
+    Args:
+        scale: a number, or one a channel, `(n_y,)`, or one an entry, `(t_ini, n_y)`, in the units of the outputs.
+        relative: scale |y_ini| in place of scale, the Euclidean norm over the entries that share the scale: all of
+            them, or those of the channel, or the entry itself.
+    """
+
+    def __init__(self, scale: Any, *, relative: bool = False):
+        self.scale = _sizes("scale", scale)
+        self.relative = relative
+
+    def minimize_linear(self, c: Tensor, y_ini: Tensor) -> Tensor:
+        scale = self._reach(y_ini)
+        return -scale * direction(scale * c)
+
+    def project(self, p: Tensor, y_ini: Tensor) -> Tensor:
+        # p_i scale_i^2 / (scale_i^2 + mu), mu >= 0 the root of a decreasing function of one variable
+        square = self._reach(y_ini).square().expand_as(p)
+        low = torch.zeros_like(euclidean(p))
+        reached = torch.where(square > 0, p, 0.0)
+        largest = square.amax((-2, -1), keepdim=True)
+        high = euclidean(p) * largest.sqrt() + largest
+        for _ in range(200):  # bisection to the last bit
+            middle = (low + high) / 2
+            inside = euclidean(reached * square.sqrt() / (square + middle).clamp_min(torch.finfo(p.dtype).tiny)) <= 1
+            low, high = torch.where(inside, low, middle), torch.where(inside, middle, high)
+        outside = euclidean(torch.where(square > 0, reached / square.sqrt(), 0.0)) > 1
+        return torch.where(outside, reached * square / (square + high), reached)
+
+    def excess(self, p: Tensor, y_ini: Tensor) -> Tensor:
+        return euclidean(ratio(p.abs(), self._reach(y_ini)))[..., 0, 0] - 1
+
+    def _reach(self, y_ini: Tensor) -> Tensor:
+        scale = self.scale.to(y_ini)
+        if not self.relative:
+            return scale
+        dims = _shared(scale)
+        return scale * (torch.linalg.vector_norm(y_ini, dim=dims, keepdim=True) if dims else y_ini.abs())
+
+
+def _shared(size: Tensor) -> tuple[int, ...]:
+    """Return the dimensions of a window whose entries share one size."""
+    return ((-2, -1), (-2,), ())[size.ndim]
+
+
+def _sizes(name: str, value: Any) -> Tensor:
+    sizes = nonnegative(name, value)
+    if sizes.ndim > 2:
+        raise ValueError(f"`{name}` must be a number or have shape (n_y,) or (t_ini, n_y), got {tuple(sizes.shape)}.")
+    return sizes

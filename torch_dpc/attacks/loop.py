@@ -1,0 +1,170 @@
+"""Attacks of several gradient steps: one loop, with hooks for the start, the direction of a step and its projection.
+
+The first walk starts at p = 0 with Algorithm 1's step, so Algorithm 1 is the loop cut off after that. The best
+perturbation seen is kept, sample by sample: never worse than Algorithm 1, nor than no attack.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..checks import as_data
+from ..layer import DPCLayer
+from .budgets import Budget
+from .objective import Objective, checked
+
+#: A step that promises to change psi by less than this fraction is rounding, and is not taken; a change of psi by less
+#: than this fraction is no improvement.
+NOISE_FLOOR = 1e-10
+#: A sample whose psi has not improved for this many steps in a row is left where it was best.
+PATIENCE = 6
+
+
+@dataclass
+class Walk:
+    """Where every sample of the batch stands.
+
+    Attributes:
+        p, psi, gradient: at present.
+        best_p, best_psi, best_gradient: where psi was least so far.
+        stalls: steps in a row that did not improve psi, `(*batch,)`.
+        size: what has become of the step size, `(*batch, 1, 1)`.
+        velocity: of momentum.
+    """
+
+    p: Tensor
+    psi: Tensor
+    gradient: Tensor
+    best_p: Tensor
+    best_psi: Tensor
+    best_gradient: Tensor
+    stalls: Tensor
+    size: Tensor
+    velocity: Tensor
+
+    @staticmethod
+    def at(p: Tensor) -> Walk:
+        """Return a walk that has seen nothing yet."""
+        none, psi = torch.zeros_like(p), torch.full(p.shape[:-2], torch.inf, dtype=p.dtype, device=p.device)
+        size = torch.ones_like(psi)[..., None, None]
+        return Walk(p, psi, none, p, psi, none, torch.zeros_like(psi), size, none)
+
+    def see(self, psi: Tensor, gradient: Tensor) -> None:
+        """Take note of psi and its gradient at p."""
+        better = improves(psi, self.best_psi)
+        chosen = better[..., None, None]
+        self.psi, self.gradient = psi, gradient
+        self.best_p = torch.where(chosen, self.p, self.best_p)
+        self.best_psi = torch.where(better, psi, self.best_psi)
+        self.best_gradient = torch.where(chosen, gradient, self.best_gradient)
+        self.stalls = torch.where(better, 0.0, self.stalls + 1)
+
+    def return_to_best(self) -> None:
+        """Take back steps that did not improve psi."""
+        self.p, self.psi, self.gradient = self.best_p, self.best_psi, self.best_gradient
+
+
+def improves(psi: Tensor, least: Tensor) -> Tensor:
+    """Return whether psi is below the least so far by more than rounding."""
+    return psi < torch.where(least.isfinite(), least - NOISE_FLOOR * least.abs(), least)
+
+
+class IterativeAttack:
+    """The loop: start, linearise, step, keep the best.
+
+    Args:
+        layer: what the attacker believes the controller solves, a surrogate if need be.
+        cost: psi, a callable DPCSolution -> `(*batch,)`.
+        budget: the admissible perturbations.
+        steps: gradient steps after the first.
+        restarts: walks, each from a start of its own: the first from zero, the others from random perturbations.
+    """
+
+    #: Whether a step that does not improve psi is taken back, so that the next one starts from the best.
+    takes_back = False
+
+    def __init__(self, layer: DPCLayer, cost: Any, budget: Budget, steps: int = 20, *, restarts: int = 1):
+        if not isinstance(steps, int) or isinstance(steps, bool) or steps < 0:
+            raise ValueError(f"`steps` must be an integer, 0 or more, got {steps!r}.")
+        if not isinstance(restarts, int) or isinstance(restarts, bool) or restarts < 1:
+            raise ValueError(f"`restarts` must be an integer, 1 or more, got {restarts!r}.")
+        self.layer, self.cost, self.budget = layer, cost, budget
+        self.steps, self.restarts = steps, restarts
+
+    def __call__(
+        self,
+        u_ini: Any,
+        y_ini: Any,
+        *,
+        y_ref: Any = None,
+        u_ref: Any = None,
+        generator: torch.Generator | None = None,
+        step: int = 0,
+    ) -> Tensor:
+        """Return p, the shape and dtype of y_ini; the call of every attack.
+
+        Args:
+            u_ini, y_ini: the true windows, `(*batch, t_ini, n)`.
+            y_ref, u_ref: references, as the layer takes them.
+            generator: of the random starts; unused where there are none.
+            step: of the run, for costs that move with it.
+        """
+        y_ini = as_data("y_ini", y_ini)
+        objective = self._objective(u_ini, y_ini, y_ref, u_ref, step, generator=generator)
+        for restart in range(self.restarts):
+            walk = self._walk(objective, self._start(restart, objective.y_ini, generator), restart == 0)
+            if restart == 0:
+                p, least = walk.best_p, walk.best_psi
+            else:
+                better = improves(walk.best_psi, least)
+                p = torch.where(better[..., None, None], walk.best_p, p)
+                least = torch.where(better, walk.best_psi, least)
+        return checked(p.to(y_ini.dtype), y_ini, self.budget)
+
+    def _walk(self, objective: Objective, start: Tensor, is_first: bool) -> Walk:
+        """Go from one start; a sample whose gradient is at the floor, or whose psi stalls, leaves the batch."""
+        walk = Walk.at(start)
+        active = torch.ones_like(walk.psi, dtype=torch.bool)
+        for k in range(self.steps + 1):
+            walk.see(*objective.gradient(walk.p, active))
+            if self.takes_back:
+                walk.return_to_best()
+            vertex = self.budget.minimize_linear(walk.gradient, objective.y_ini)
+            promised = (walk.gradient * (walk.p - vertex)).sum((-2, -1))
+            floor = torch.where(walk.psi.isfinite(), NOISE_FLOOR * walk.psi.abs(), torch.inf)
+            active = active & (promised > floor) & (walk.stalls < PATIENCE)
+            if not bool(active.any()):
+                return walk
+            if is_first and k == 0:
+                moved = vertex  # Algorithm 1
+            else:
+                step = self._direction(walk, vertex, objective.y_ini, k)
+                moved = self._project(walk.p + step, objective.y_ini)
+            walk.p = torch.where(active[..., None, None], moved, walk.p)
+        return self._end(walk, objective, active)
+
+    def _start(self, restart: int, y_ini: Tensor, generator: torch.Generator | None) -> Tensor:
+        """Return where a walk starts."""
+        return torch.zeros_like(y_ini) if restart == 0 else self.budget.random(y_ini, generator)
+
+    def _direction(self, walk: Walk, vertex: Tensor, y_ini: Tensor, k: int) -> Tensor:
+        """Return the step from walk.p, length included; `vertex` minimises the linearisation there over the budget."""
+        raise NotImplementedError
+
+    def _project(self, p: Tensor, y_ini: Tensor) -> Tensor:
+        """Return what a step that may have left the budget becomes."""
+        return self.budget.project(p, y_ini)
+
+    def _end(self, walk: Walk, objective: Objective, active: Tensor) -> Walk:
+        """Look at the last step."""
+        with torch.no_grad():
+            walk.see(objective.psi(walk.p, active), walk.gradient)
+        return walk
+
+    def _objective(self, *call: Any, generator: torch.Generator | None) -> Objective:
+        """Return what is minimised in a call with (u_ini, y_ini, y_ref, u_ref, step)."""
+        return Objective(self.layer, self.cost, *call)

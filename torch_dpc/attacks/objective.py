@@ -1,0 +1,167 @@
+"""What an attack minimises, psi(u*(p)), with its gradient through the layer, and the check of every answer."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..checks import as_data
+from ..errors import Status
+from ..layer import DPCLayer
+from ..solution import DPCSolution, SolveInfo
+from .budgets import Budget
+from .costs import bound
+from .references import last_rows, to_horizon
+
+#: How far outside its budget a perturbation may be, relative to the budget's size, before it is a defect.
+BUDGET_TOLERANCE = 1e-9
+
+
+class Objective:
+    """psi(u*(p)) of one call of an attack, sample by sample, in float64.
+
+    The layer may be a surrogate: references are cut to its horizon or their last row held, and it may look at fewer
+    past steps than the windows have (the older rows then have a zero gradient).
+
+    Args:
+        layer: what the attacker believes the controller solves.
+        cost: psi, a callable DPCSolution -> `(*batch,)`, with or without `at` and `given`.
+        u_ini, y_ini: the true windows, `(*batch, t_ini, n)`.
+        y_ref, u_ref: references, as the layer takes them.
+        step: of the run.
+
+    Raises:
+        ValueError: shapes that do not fit.
+    """
+
+    def __init__(self, layer: Any, cost: Any, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any, step: int):
+        with torch.inference_mode(False):  # what inference mode made cannot enter a graph
+            u_ini, y_ini = (
+                as_data(name, w).detach().double().clone() for name, w in (("u_ini", u_ini), ("y_ini", y_ini))
+            )
+        if y_ini.ndim < 2:
+            raise ValueError(f"`y_ini` must have shape (*batch, t_ini, n_y), got {tuple(y_ini.shape)}.")
+        self.layer, self.y_ini, self.batch = layer, y_ini, y_ini.shape[:-2]
+        self.u_ini = _of_batch("u_ini", u_ini, self.batch)
+        data = getattr(layer, "data", None)
+        horizon = None if data is None else data.horizon
+        self.refs = {
+            "y_ref": _reference("y_ref", y_ref, horizon, self.batch),
+            "u_ref": _reference("u_ref", u_ref, horizon, self.batch),
+        }
+        self.t_ini = y_ini.shape[-2] if data is None else data.t_ini
+        self.cost = bound(cost, step, self.u_ini, y_ini, **self.refs)
+        self._last: DPCSolution | None = None
+
+    def psi(self, p: Tensor, of: Tensor | None = None) -> Tensor:
+        """Return psi at p, `(*batch,)`, with the graph of p; infinity where there is no plan.
+
+        Args:
+            p: the perturbation, `(*batch, t_ini, n_y)`, float64.
+            of: the samples that are asked for, `(*batch,)`, boolean; the others' values are those of the last call.
+        """
+        if is_everyone(of):
+            of = None
+        u_ini, y_ini = (last_rows(self._of(of, w), self.t_ini) for w in (self.u_ini, self.y_ini + p))
+        solution = self.layer(u_ini, y_ini, **self._refs_of(of), on_failure="nan")
+        if of is not None:
+            solution = self._among_the_last(solution, of)
+        self._last = _detached(solution)
+        return torch.where(solution.info.status == Status.SOLVED, self._judged(solution), torch.inf)
+
+    def gradient(self, p: Tensor, of: Tensor | None = None) -> tuple[Tensor, Tensor]:
+        """Return psi and its gradient in p, zero where there is no plan and for samples not asked for."""
+        with torch.inference_mode(False), torch.enable_grad():
+            p = p.detach().clone().requires_grad_()
+            psi = self.psi(p, of)
+            total = torch.where(psi.isfinite(), psi, 0.0).sum()
+            (gradient,) = torch.autograd.grad(total, p) if total.requires_grad else (torch.zeros_like(p),)
+        psi = psi.detach()
+        return psi, torch.where(psi.isfinite()[..., None, None], gradient, 0.0)
+
+    def _judged(self, plan: Any) -> Tensor:
+        psi = self.cost(plan)
+        if psi.shape != self.batch:
+            raise ValueError(f"`cost` must return one number a sample, {tuple(self.batch)}, got {tuple(psi.shape)}.")
+        return psi
+
+    def _refs_of(self, of: Tensor | None) -> dict[str, Tensor | None]:
+        """Return the references of some samples; one that the batch shares is everyone's."""
+        return {n: r if r is None or r.ndim <= 2 else self._of(of, r) for n, r in self.refs.items()}
+
+    @staticmethod
+    def _of(of: Tensor | None, values: Tensor) -> Tensor:
+        return values if of is None else values[of]
+
+    def _among_the_last(self, part: DPCSolution, of: Tensor) -> DPCSolution:
+        """Put the plans of some samples among the last plans of all: a cost may know the batch it was made for."""
+        last = self._last
+        assert last is not None, "the first call asks for every sample"
+
+        def placed(new: Tensor, old: Tensor) -> Tensor:
+            return old.index_put((of,), new)
+
+        def nonsingular() -> Tensor:
+            return placed(part.info.nonsingular, last.info.nonsingular)
+
+        info = SolveInfo(placed(part.info.table, last.info.table), part.info.is_selection, nonsingular)
+        whole = {name: placed(getattr(part, name), getattr(last, name)) for name in ("u", "y", "lam")}
+        return replace(part, info=info, _make_g=lambda: placed(part.g, last.g), **whole)
+
+
+def is_everyone(of: Tensor | None) -> bool:
+    """Return whether a choice of samples leaves nobody out."""
+    return of is None or bool(of.all())
+
+
+def psi_and_gradient(
+    layer: DPCLayer, cost: Any, u_ini: Any, y_ini: Tensor, p: Tensor, y_ref: Any, u_ref: Any, step: int
+) -> tuple[Tensor, Tensor]:
+    """Return psi(u*(p)), `(*batch,)`, and its gradient in p; infinity and 0 where there is no plan."""
+    return Objective(layer, cost, u_ini, y_ini, y_ref, u_ref, step).gradient(p.double())
+
+
+def checked(p: Tensor, y_ini: Tensor, budget: Budget) -> Tensor:
+    """Return p, after a look at the budget by someone other than the attack, in float64.
+
+    A p of lower precision may be outside by the rounding of its own entries; it is drawn in by that much.
+
+    Raises:
+        AssertionError: p is outside its budget by more than 1e-9 of the budget's size.
+    """
+    excess = budget.excess(p.detach().double(), y_ini.detach().double())
+    if p.dtype != torch.float64:
+        eps = torch.finfo(p.dtype).eps
+        outside = (excess > 0) & (excess <= 10 * eps)
+        p = torch.where(outside[..., None, None], p * (1 - excess[..., None, None] - 2 * eps).to(p.dtype), p)
+        excess = budget.excess(p.detach().double(), y_ini.detach().double())
+    if not bool((excess <= BUDGET_TOLERANCE).all()):
+        raise AssertionError(f"the attack left its budget by {float(excess.max()):.1e} of its size.")
+    return p
+
+
+def _of_batch(name: str, value: Tensor, batch: torch.Size) -> Tensor:
+    try:
+        return value.expand(*batch, *value.shape[-2:])
+    except RuntimeError as error:
+        raise ValueError(
+            f"`{name}` must have the batch shape of y_ini, {tuple(batch)}, or broadcast to it, got shape "
+            f"{tuple(value.shape)}. Expand y_ini to attack several cases of one window."
+        ) from error
+
+
+def _reference(name: str, value: Any, horizon: int | None, batch: torch.Size) -> Tensor | None:
+    """Return a reference that the layer takes: None, shared by the batch, or one a sample."""
+    if value is None:
+        return None
+    tensor = as_data(name, value)
+    tensor = tensor if horizon is None else to_horizon(tensor, horizon)
+    return tensor if tensor.ndim <= 2 else _of_batch(name, tensor, batch)
+
+
+def _detached(solution: DPCSolution) -> DPCSolution:
+    info = SolveInfo(solution.info.table.detach(), solution.info.is_selection, lambda: solution.info.nonsingular)
+    return replace(solution, u=solution.u.detach(), y=solution.y.detach(), lam=solution.lam.detach(), info=info)

@@ -1,0 +1,53 @@
+"""Persistency of excitation: does the recorded input hold enough of every direction?"""
+
+from __future__ import annotations
+
+import warnings
+
+import torch
+from torch import Tensor
+
+from .errors import ExcitationWarning
+from .recordings import hankel
+from .rowspace import relative_tolerance
+
+
+def excitation_order(recordings: list[Tensor]) -> int:
+    """Return the largest depth whose (mosaic-)Hankel matrix of the inputs has full row rank.
+
+    Args:
+        recordings: inputs, each `(T, n_u)`.
+
+    Example:
+        >>> u = torch.tensor([0.0, 0.0, 1.0, 0.0, 0.0], dtype=torch.float64).reshape(5, 1)
+        >>> excitation_order([u]), excitation_order([torch.ones(9, 1)])
+        (3, 1)
+    """
+    low, high = 0, max(recording.shape[0] for recording in recordings)
+    while low < high:  # full row rank at depth L implies it at every smaller depth: bisect
+        middle = (low + high + 1) // 2
+        blocks = torch.cat([hankel(w, middle) for w in recordings if w.shape[0] >= middle], dim=1)
+        full = has_full_row_rank(blocks, relative_tolerance(blocks.dtype))
+        low, high = (middle, high) if full else (low, middle - 1)
+    return low
+
+
+def has_full_row_rank(matrix: Tensor, tolerance: float) -> bool:
+    """Return whether the smallest singular value exceeds a fraction of the largest."""
+    if matrix.shape[0] > matrix.shape[1]:
+        return False
+    R = torch.linalg.qr(matrix.double().T, mode="r").R
+    singular = torch.linalg.svdvals(R)
+    return bool(singular[-1] > tolerance * singular[0])
+
+
+def warn_of_excitation(order: int, depth: int, windows: int, n_u: int, *, stacklevel: int) -> None:
+    """Warn that the input is not persistently exciting of order t_ini + horizon = depth, with the numbers."""
+    warnings.warn(
+        f"the input is persistently exciting of order {order}, {depth} (t_ini + horizon) is "
+        f"needed, and {depth} plus the order of the system for a guarantee: the data do not hold every trajectory "
+        f"of the system. There are {windows} windows for {depth * n_u} input rows; record longer, or vary each "
+        f"input more.",
+        ExcitationWarning,
+        stacklevel=stacklevel + 1,
+    )

@@ -1,0 +1,251 @@
+"""The rows of the problem in the coordinates of the data's own row space, where n_g is gone.
+
+With g = B a (:mod:`torch_dpc.rowspace`) the problem reads
+
+    minimise over a   1/2 |v - v_ref|_W^2 + lambda_g |N a|^2 + sum over past rows of lambda |S a - s|^2
+    subject to        Eq a = e,   v = C a in the product of the sets,
+
+with v = (u, y), and the changes of the input after them where the problem speaks of those. v_ref, s and e are entries
+of theta = (u_ini, y_ini, u_ref, y_ref). What each of the problem's terms adds is told here, and only here.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .hankel import HankelData
+from .linear import times
+from .transforms import carries_derivative
+
+#: How far u_ini may be from what the data can produce, relative to its norm.
+REACHABLE = 1e-8
+#: Singular values of the equality rows at or below this fraction of the largest count as zero.
+EQUALITY_RANK = 1e-10
+
+
+@dataclass(frozen=True)
+class Terms:
+    """Which terms the problem has beyond the paper's.
+
+    Attributes:
+        identity: lambda_g charges |g|^2 in place of |M g|^2.
+        slack: lambda_u |Up g - u_ini|^2 in place of Up g = u_ini.
+        rates: the changes of the input, u_t - u_(t-1), are constrained or charged.
+        terminal_steps: so many last outputs equal their reference.
+    """
+
+    identity: bool = False
+    slack: bool = False
+    rates: bool = False
+    terminal_steps: int = 0
+
+
+@dataclass(frozen=True)
+class Tracking:
+    """A part of v that is charged 1/2 |v - v_ref|^2 in a weight of its own.
+
+    Attributes:
+        weight: the name of the weight.
+        rows: the part of v.
+        reference: where in theta its reference begins; None for zero.
+    """
+
+    weight: str
+    rows: slice
+    reference: int | None
+
+
+@dataclass(frozen=True, eq=False)
+class Fit:
+    """Past rows that are charged weight |S a - s|^2.
+
+    Attributes:
+        weight: the name of the weight.
+        rows: S, `(k, r)`.
+        measured: where in theta s begins.
+    """
+
+    weight: str
+    rows: Tensor
+    measured: int
+
+
+@dataclass(frozen=True, eq=False)
+class DataRows:
+    """The rows of a problem; leading dimensions, if any, are one data set each.
+
+    Attributes:
+        Up, Yp, Uf, Yf: the data, `(rows, r)`.
+        C: the rows of v, `(N, r)`.
+        Eq: the equality rows, `(n_eq, r)`.
+        Eq_theta: which entries of theta they equal, `(n_eq,)`.
+        Eq_pinv: the pseudo-inverse of Eq, `(r, n_eq)`.
+        Z: orthonormal basis of the kernel of Eq, `(r, n_x)`.
+        Eq_range: orthonormal basis of the range of Eq, or None where it is everything.
+        charged: which entries of a lambda_g charges, `(r,)` of ones and zeros: all, or those that W does not reach.
+        is_identity: whether that is all by choice.
+        tracking, fits: the terms of the cost.
+        n_theta: entries of theta.
+    """
+
+    Up: Tensor
+    Yp: Tensor
+    Uf: Tensor
+    Yf: Tensor
+    C: Tensor
+    Eq: Tensor
+    Eq_theta: Tensor
+    Eq_pinv: Tensor
+    Z: Tensor
+    Eq_range: Tensor | None
+    charged: Tensor
+    is_identity: bool
+    tracking: tuple[Tracking, ...]
+    fits: tuple[Fit, ...]
+    n_theta: int
+
+    def unreachable(self, theta: Tensor) -> Tensor:
+        """Return which samples `(B,)` ask for a u_ini, or a terminal output, that no combination of the data makes."""
+        if self.Eq_range is None:
+            return torch.zeros(theta.shape[:-1], dtype=torch.bool, device=theta.device)
+        wanted = theta[..., self.Eq_theta]
+        missed = wanted - times(self.Eq_range, times(self.Eq_range.mT, wanted))
+        norm = torch.linalg.vector_norm
+        return norm(missed, dim=-1) > REACHABLE * norm(wanted, dim=-1)
+
+    def map(self, change: Callable[[Tensor, int], Tensor]) -> DataRows:
+        """Return the rows with `change(tensor, own dimensions)` in place of each tensor that depends on the data."""
+        there = {name: x for name in _OF_DATA if (x := getattr(self, name)) is not None}
+        changed: dict[str, Any] = {name: change(x, 1 if name == "charged" else 2) for name, x in there.items()}
+        fits = tuple(replace(fit, rows=change(fit.rows, 2)) for fit in self.fits)
+        return replace(self, **changed, fits=fits)
+
+    @staticmethod
+    def stack(many: Sequence[DataRows]) -> DataRows:
+        """Return the rows of several data sets as one, a leading dimension; shorter row spaces are padded.
+
+        A padded coordinate meets no row and is charged by lambda_g, so it is zero at every solution.
+
+        Raises:
+            ValueError: the equalities have different ranks.
+        """
+        r = max(rows.C.shape[-1] for rows in many)
+        if len({rows.Z.shape[0] - rows.Z.shape[1] for rows in many}) > 1:
+            raise ValueError("the data sets of a batch must have one rank of Up: one has an idle input.")
+        padded = [_padded(rows, r - rows.C.shape[-1]) for rows in many]
+        first = padded[0]
+        changed: dict[str, Any] = {
+            name: torch.stack([getattr(rows, name) for rows in padded])
+            for name in _OF_DATA
+            if getattr(first, name) is not None
+        }
+        fits = tuple(
+            replace(fit, rows=torch.stack([rows.fits[i].rows for rows in padded])) for i, fit in enumerate(first.fits)
+        )
+        return replace(first, **changed, fits=fits)
+
+    @staticmethod
+    def of(data: HankelData, device: torch.device, terms: Terms = Terms()) -> DataRows:  # noqa: B008
+        """Return the rows of the data; a graph behind the data matrices reaches through."""
+        space = data.row_space
+        if not space.clear and carries_derivative(data.matrices):
+            raise ValueError(
+                "the data carry a graph, but their rank is not clear, and derivatives hold at constant rank: the "
+                f"singular values around the decision are {space.last_kept:.1e} (kept) and {space.first_dropped:.1e} "
+                "(dropped), relative to the largest."
+            )
+        basis = space.basis.to(device)
+        stacked = data.stacked.to(device)
+        rows = _InRowSpace.apply(stacked, basis) if carries_derivative(data.matrices) else stacked @ basis
+        Up, Yp, Uf, Yf = rows.split([len(m) for m in data.matrices])
+        u_ref = len(Up) + len(Yp)
+        y_ref = u_ref + len(Uf)
+        n_theta = y_ref + len(Yf)
+        n_v = len(Uf) + len(Yf)
+        tracking = [Tracking("R", slice(0, len(Uf)), u_ref), Tracking("Q", slice(len(Uf), n_v), y_ref)]
+        fits = [Fit("lambda_s", Yp, len(Up))]
+        parts = [Uf, Yf]
+        if terms.rates:
+            # The input before the plan is (Up a)'s last step, which the equality rows hold at the measured one.
+            parts.append(Uf - torch.cat([Up, Uf])[len(Up) - data.n_u : -data.n_u])
+            tracking.append(Tracking("R_du", slice(n_v, n_v + len(Uf)), None))
+        equal, places = [], []
+        if terms.slack:
+            fits.append(Fit("lambda_u", Up, 0))
+        else:
+            equal.append(Up)
+            places.append(torch.arange(len(Up)))
+        if terms.terminal_steps:
+            last = terms.terminal_steps * data.n_y
+            equal.append(Yf[-last:])
+            places.append(torch.arange(n_theta - last, n_theta))
+        Eq = torch.cat(equal) if equal else Up[:0]
+        Eq_theta = torch.cat(places) if places else torch.arange(0)
+        return DataRows(
+            *(Up, Yp, Uf, Yf, torch.cat(parts), Eq, Eq_theta.to(device), *_eliminate(Eq.detach())),
+            charged=(torch.arange(space.rank, device=device) >= (0 if terms.identity else space.rank_W)).double(),
+            is_identity=terms.identity,
+            tracking=tuple(tracking),
+            fits=tuple(fits),
+            n_theta=n_theta,
+        )
+
+
+#: The fields that depend on the data.
+_OF_DATA = ("Up", "Yp", "Uf", "Yf", "C", "Eq", "Eq_pinv", "Z", "Eq_range", "charged")
+
+
+def _padded(rows: DataRows, more: int) -> DataRows:
+    """Return the rows with `more` coordinates that meet none of them."""
+    pad = torch.nn.functional.pad
+    wide: dict[str, Any] = {name: pad(getattr(rows, name), (0, more)) for name in ("Up", "Yp", "Uf", "Yf", "C", "Eq")}
+    return replace(
+        rows,
+        **wide,
+        Eq_pinv=pad(rows.Eq_pinv, (0, 0, 0, more)),
+        Z=torch.block_diag(rows.Z, torch.eye(more, dtype=rows.Z.dtype, device=rows.Z.device)),
+        charged=pad(rows.charged, (0, more), value=1.0),
+        fits=tuple(replace(fit, rows=pad(fit.rows, (0, more))) for fit in rows.fits),
+    )
+
+
+def _eliminate(Eq: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Return Eq^+, a basis of the kernel of Eq, and one of its range where that is not everything."""
+    if len(Eq) == 0:
+        return Eq.mT, torch.eye(Eq.shape[1], dtype=Eq.dtype, device=Eq.device), None
+    with torch.no_grad():
+        left, singular, right_h = torch.linalg.svd(Eq, full_matrices=True)
+        rank = int((singular > EQUALITY_RANK * singular[0].clamp_min(torch.finfo(torch.float64).tiny)).sum())
+        pinv = (right_h[:rank].T / singular[:rank]) @ left[:, :rank].T
+        reached = None if rank == len(Eq) else left[:, :rank].contiguous()
+        return pinv, right_h[rank:].T.contiguous(), reached
+
+
+class _InRowSpace(torch.autograd.Function):
+    """(D, B) -> D B for an orthonormal basis B of the rows of D, which moves with D.
+
+    What follows depends on D through D D' alone, so that to first order, and only so, B may be taken as fixed:
+    D_bar = bar B'. A derivative of that is refused.
+    """
+
+    @staticmethod
+    def forward(D: Tensor, basis: Tensor) -> Tensor:  # noqa: D102
+        return D @ basis
+
+    @staticmethod
+    def setup_context(ctx: object, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:  # noqa: D102
+        ctx.save_for_backward(inputs[1])  # type: ignore[attr-defined]
+
+    @staticmethod
+    def backward(ctx: object, bar: Tensor) -> tuple[Tensor, None]:  # noqa: D102
+        if torch.is_grad_enabled() and bar.requires_grad:
+            raise NotImplementedError(
+                "the derivative with respect to the recorded data is of first order: it cannot be taken with "
+                "`create_graph=True`. Detach the data, or ask for first derivatives."
+            )
+        return bar @ ctx.saved_tensors[0].mT, None  # type: ignore[attr-defined]

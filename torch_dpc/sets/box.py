@@ -1,0 +1,195 @@
+"""Boxes, hard and soft."""
+
+from __future__ import annotations
+
+import math
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from .base import ConvexSet
+from .parameters import as_bound, as_tensor, short
+
+
+class Box(ConvexSet):
+    """The box lower <= x <= upper.
+
+    Args:
+        lower, upper: numbers, or `(n,)` for each channel, or `(horizon, n)` for each step of the plan, or
+            `(*batch, horizon, n)` for each sample of a call; infinite ends are allowed. A tensor keeps its graph, an
+            `nn.Parameter` learns.
+        per: a box is the same for a step and for a trajectory, but takes `(horizon n,)` bounds for the latter.
+
+    Raises:
+        ValueError: bounds that are NaN, crossed, or closed at an infinity.
+
+    Example:
+        >>> Box(-1.0, 1.0).project(torch.tensor([0.5, 3.0]))
+        tensor([0.5000, 1.0000])
+    """
+
+    separable = True
+
+    def __init__(self, lower: Any, upper: Any, *, per: str = "step"):
+        super().__init__(per)
+        self.lower = as_bound("lower", lower)
+        self.upper = as_bound("upper", upper)
+        self.check_bounds()
+
+    def bounds(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Return lower and upper as tensors of the dtype and on the device of another; graphs are kept."""
+        lower, upper = (as_tensor(bound).to(like) for bound in (self.lower, self.upper))
+        if self.per == "trajectory":
+            lower, upper = (bound.flatten(-2) if bound.ndim > 1 else bound for bound in (lower, upper))
+        return lower, upper
+
+    def check(self, name: str, steps: int, channels: int) -> None:
+        places = self.parts(steps, channels)[0][1]
+        for bound in (self.lower, self.upper):
+            shape = bound.shape if isinstance(bound, Tensor) else ()
+            if self.per == "trajectory" and len(shape) > 1:
+                shape = (*shape[:-2], shape[-2] * shape[-1])
+            own = places.shape[-len(shape) :] if len(shape) < 2 else places.shape
+            if len(shape) and any(a not in (1, b) for a, b in zip(shape[-2:], own, strict=True)):
+                raise ValueError(
+                    f"the bounds of `{name}` must be numbers or have shape ({channels},), ({steps}, {channels}) or "
+                    f"(*batch, {steps}, {channels}), got {tuple(bound.shape)}."  # type: ignore[union-attr]
+                )
+
+    def check_bounds(self) -> None:
+        """Raise ValueError unless lower <= upper and a finite point lies between."""
+        lower, upper = (as_tensor(bound).detach().double().cpu() for bound in (self.lower, self.upper))
+        if not bool((lower <= upper).all()):
+            raise ValueError("`lower` must be at most `upper` in every component, got crossed or NaN bounds.")
+        if bool((lower == math.inf).any()) or bool((upper == -math.inf).any()):
+            raise ValueError("`lower` must be below +infinity and `upper` above -infinity.")
+
+    def project(self, x: Tensor) -> Tensor:
+        lower, upper = self.bounds(x)
+        return torch.maximum(torch.minimum(x, upper), lower)
+
+    def jacobian(self, x: Tensor, gamma: Any = 1.0) -> Tensor:
+        return torch.diag_embed(self.jacobian_diagonal(x, gamma))
+
+    def jacobian_diagonal(self, x: Tensor, gamma: Any = 1.0) -> Tensor:
+        lower, upper = self.bounds(x)
+        return ((x >= lower) & (x <= upper) & (lower < upper)).to(x)
+
+    def jacobian_product(self, x: Tensor, v: Tensor) -> Tensor:
+        return self.jacobian_diagonal(x) * v
+
+    def bounded_direction(self, d: Tensor) -> Tensor:
+        lower, upper = self.bounds(d)
+        return torch.where(torch.where(d > 0, upper, lower).isfinite(), d, 0.0)
+
+    def minimize_linear(self, c: Tensor) -> Tensor:
+        lower, upper = self.bounds(c)
+        anywhere = torch.minimum(torch.maximum(torch.zeros_like(c), lower), upper)  # where c = 0 any point will do
+        return torch.where(c > 0, lower.expand_as(c), torch.where(c < 0, upper.expand_as(c), anywhere))
+
+    def slack(self, x: Tensor) -> Tensor:
+        lower, upper = self.bounds(x)
+        return torch.minimum(x - lower, upper - x)
+
+    def config(self) -> dict[str, Any]:
+        return {"lower": self.lower, "upper": self.upper, "per": self.per}
+
+    def extra_repr(self) -> str:
+        """Show the bounds."""
+        return f"lower={short(self.lower)}, upper={short(self.upper)}"
+
+
+class Reals(Box):
+    """No constraint."""
+
+    def __init__(self) -> None:
+        super().__init__(-math.inf, math.inf)
+
+    def config(self) -> dict[str, Any]:
+        return {}
+
+    def extra_repr(self) -> str:
+        """Show nothing: there are no bounds."""
+        return ""
+
+
+class NonNegative(Box):
+    """The non-negative orthant x >= 0.
+
+    Example:
+        >>> NonNegative().project(torch.tensor([-0.5, 3.0]))
+        tensor([0., 3.])
+    """
+
+    def __init__(self) -> None:
+        super().__init__(0.0, math.inf)
+
+    def config(self) -> dict[str, Any]:
+        return {}
+
+    def extra_repr(self) -> str:
+        """Show nothing: there are no bounds to choose."""
+        return ""
+
+
+class SoftBox(ConvexSet):
+    """A box that may be left at a price: weight times the distance to it is charged, channel by channel.
+
+    This is the exact penalty of the box: a plan whose multipliers stay below `weight` in the hard box is found without
+    leaving it, and where the box excludes every plan there still is one.
+
+    Args:
+        lower, upper: as for :class:`Box`.
+        weight: price of one unit beyond a bound, in units of the cost; a number, `(n,)` or `(horizon, n)`. A tensor
+            keeps its graph, an `nn.Parameter` learns.
+
+    Example:
+        >>> soft = SoftBox(-1.0, 1.0, weight=2.0)
+        >>> soft.prox(torch.tensor([0.5, 2.5, 4.0]), gamma=1.0)       # inside, held at the bound, beyond it
+        tensor([0.5000, 1.0000, 2.0000])
+    """
+
+    separable = True
+
+    def __init__(self, lower: Any, upper: Any, weight: Any):
+        super().__init__()
+        self.box = Box(lower, upper)
+        self.weight = as_bound("weight", weight)
+        if not bool((as_tensor(self.weight).detach() > 0).all()):
+            raise ValueError("`weight` must be positive: without a price there is no bound.")
+
+    def project(self, x: Tensor) -> Tensor:
+        return self.box.project(x)
+
+    def prox(self, x: Tensor, gamma: Any) -> Tensor:
+        pull = x - self.box.project(x)
+        most = gamma * as_tensor(self.weight).to(x)
+        return x - torch.minimum(torch.maximum(pull, -most), most)
+
+    def jacobian(self, x: Tensor, gamma: Any = 1.0) -> Tensor:
+        return torch.diag_embed(self.jacobian_diagonal(x, gamma))
+
+    def jacobian_diagonal(self, x: Tensor, gamma: Any = 1.0) -> Tensor:
+        pull = (x - self.box.project(x)).abs()
+        held = (pull > 0) & (pull <= gamma * as_tensor(self.weight).to(x))
+        return (~held).to(x)
+
+    def minimize_linear(self, c: Tensor) -> Tensor:
+        return self.box.minimize_linear(c)
+
+    def support(self, d: Tensor) -> Tensor:
+        return torch.where(d == 0, torch.zeros_like(d), math.inf).sum(-1)  # no point is out of the question
+
+    def bounded_direction(self, d: Tensor) -> Tensor:
+        return torch.zeros_like(d)
+
+    def slack(self, x: Tensor) -> Tensor:
+        return self.box.slack(x).abs()
+
+    def config(self) -> dict[str, Any]:
+        return {"lower": self.box.lower, "upper": self.box.upper, "weight": self.weight}
+
+    def extra_repr(self) -> str:
+        """Show the price."""
+        return f"weight={short(self.weight)}"

@@ -1,0 +1,245 @@
+"""All sets of a problem as one: a product over parts of the constrained rows v."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from dataclasses import dataclass
+from functools import cached_property
+from typing import cast
+
+import torch
+from torch import Tensor, nn
+
+from .base import ConvexSet, Part
+from .box import Box
+
+#: The Jacobian of the projection, part by part: its diagonal `(..., groups, size)` where the set is separable, blocks
+#: `(..., groups, size, size)` otherwise.
+Blocks = list[Tensor]
+
+
+@dataclass(frozen=True, eq=False)
+class FeasibleSet:
+    """The product of the sets of a problem.
+
+    Methods other than `bounds` work in *part order*, v[..., order]: the entries of one part side by side.
+
+    Attributes:
+        parts: every set with the rows it holds for, `(groups, size)`.
+    """
+
+    parts: list[Part]
+
+    @staticmethod
+    def of(sets: Iterable[tuple[str, ConvexSet, int, int]]) -> FeasibleSet:
+        """Put sets side by side, each (name, set, steps, channels).
+
+        Raises:
+            ValueError: a set does not fit.
+        """
+        parts: list[Part] = []
+        start = 0
+        for name, owner, steps, channels in sets:
+            owner.check(name, steps, channels)
+            parts += [(leaf, start + places) for leaf, places in owner.parts(steps, channels)]
+            start += steps * channels
+        return FeasibleSet(parts)
+
+    def snapshot(self) -> FeasibleSet:
+        """Return the same sets with the parameters that they have now."""
+        return FeasibleSet([(cast(ConvexSet, _snapshot(owner)), places) for owner, places in self.parts])
+
+    @cached_property
+    def order(self) -> Tensor:
+        """The rows of v in part order, `(N,)`."""
+        return torch.cat([places.reshape(-1) for _, places in self.parts])
+
+    @cached_property
+    def inverse(self) -> Tensor:
+        """Where each row of v stands in part order, `(N,)`."""
+        return self.order.argsort()
+
+    @cached_property
+    def _slices(self) -> list[tuple[ConvexSet, slice, tuple[int, ...]]]:
+        found, start = [], 0
+        for owner, places in self.parts:
+            found.append((owner, slice(start, start + places.numel()), tuple(places.shape)))
+            start += places.numel()
+        return found
+
+    @property
+    def tails(self) -> tuple[int, ...]:
+        """How many dimensions of each block of D1 are its own."""
+        return tuple(2 if owner.separable else 3 for owner, _ in self.parts)
+
+    @property
+    def batch_shape(self) -> torch.Size:
+        """The batch dimensions that the sets' own parameters have."""
+        return self.prox(torch.zeros(len(self.order), dtype=torch.float64)).shape[:-1]
+
+    @property
+    def is_box(self) -> bool:
+        """Whether all sets together are a box."""
+        return all(isinstance(owner, Box) for owner, _ in self.parts)
+
+    def bounds(self, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Return lower and upper of v where the sets are a box, `(..., N)` each, float64, with their graph."""
+        like = torch.empty(0, dtype=torch.float64, device=device)
+        sides: tuple[list[Tensor], list[Tensor]] = ([], [])
+        for owner, places in self.parts:
+            assert isinstance(owner, Box)
+            owner.check_bounds()
+            for side, value in zip(sides, owner.bounds(like), strict=True):
+                side.append(torch.broadcast_to(value, (*value.shape[:-2], *places.shape)).flatten(-2))
+        inverse = self.inverse.to(device)
+        return _joined(sides[0])[..., inverse], _joined(sides[1])[..., inverse]
+
+    def prox(self, x: Tensor, gamma: Tensor | float = 1.0) -> Tensor:
+        """Return the projection of x, `(..., N)`; the proximal map where a penalty stands in place of a set.
+
+        gamma is one number, or `(..., N)`, equal within every group.
+        """
+        return _joined(
+            [
+                owner.prox(self._group(x, at, shape), self._scale(gamma, at, shape)).flatten(-2)
+                for owner, at, shape in self._slices
+            ]
+        )
+
+    def jacobians(self, x: Tensor, gamma: Tensor | float) -> Blocks:
+        """Return D1 at x."""
+        return [
+            (owner.jacobian_diagonal if owner.separable else owner.jacobian)(
+                self._group(x, at, shape), self._scale(gamma, at, shape)
+            )
+            for owner, at, shape in self._slices
+        ]
+
+    def largest_of_group(self, x: Tensor) -> Tensor:
+        """Return x, `(N,)`, with the largest entry of its group in place of each."""
+        groups = [(self._group(x, at, shape), shape) for _, at, shape in self._slices]
+        return torch.cat([group.amax(-1, keepdim=True).expand(shape).flatten() for group, shape in groups])
+
+    def complement_times(self, blocks: Blocks, matrix: Tensor) -> Tensor:
+        """Return (I - D1) matrix, `(..., N, k)`."""
+        out = []
+        for (owner, at, shape), D in self._with(blocks):
+            rows = matrix[..., at, :].unflatten(-2, shape)  # (..., groups, size, k)
+            moved = D[..., None] * rows if owner.separable else D @ rows
+            out.append((rows - moved).flatten(-3, -2))
+        batch = torch.broadcast_shapes(*(part.shape[:-2] for part in out))
+        return torch.cat([part.expand(*batch, *part.shape[-2:]) for part in out], dim=-2)
+
+    def freed(self, blocks: Blocks, weak: Tensor) -> Blocks:
+        """Return D1 with the identity at the rows that count as inactive, `(..., N)`; a block is freed as a whole."""
+        out = []
+        for (owner, at, shape), D in zip(self._slices, blocks, strict=True):
+            free = self._group(weak, at, shape)
+            if owner.separable:
+                out.append(torch.where(free, 1.0, D))
+            else:
+                eye = torch.eye(shape[-1], dtype=D.dtype, device=D.device)
+                out.append(torch.where(free.all(-1)[..., None, None], eye, D))
+        return out
+
+    def weak(self, x: Tensor, small: Tensor) -> Tensor:
+        """Return the rows whose multiplier is none: where `small` says so, whole groups unless the set is separable."""
+        out = []
+        for owner, at, shape in self._slices:
+            group = self._group(small, at, shape)
+            out.append((group if owner.separable else group.all(-1, keepdim=True).expand_as(group)).flatten(-2))
+        return torch.cat(out, dim=-1)
+
+    def touching(self, v: Tensor, weak: Tensor, reach: float) -> Tensor:
+        """Return how many bounds v touches where `weak` says that no multiplier holds it there, `(...)`."""
+        count = torch.zeros(v.shape[:-1], dtype=torch.int64, device=v.device)
+        for owner, at, shape in self._slices:
+            slack = owner.slack(self._group(v, at, shape))
+            near = slack.abs() <= reach * (1 + self._group(v, at, shape).abs().amax(-1, keepdim=True))
+            free = self._group(weak, at, shape)
+            count = count + (near & (free if slack.shape == free.shape else free[..., :1])).sum((-2, -1))
+        return count
+
+    def support(self, d: Tensor) -> Tensor:
+        """Return the supremum over the sets of <d, v>, `(...)`."""
+        each = [owner.support(self._group(d, at, shape)).sum(-1) for owner, at, shape in self._slices]
+        return torch.stack(each).sum(0)
+
+    def bounded_direction(self, d: Tensor) -> Tensor:
+        """Return a direction near d in which the sets are bounded."""
+        return _joined(
+            [owner.bounded_direction(self._group(d, at, shape)).flatten(-2) for owner, at, shape in self._slices]
+        )
+
+    def apply(self, blocks: Blocks, x: Tensor) -> Tensor:
+        """Return D1 x, `(..., N)`."""
+        out = []
+        for (owner, at, shape), D in zip(self._slices, blocks, strict=True):
+            group = self._group(x, at, shape)
+            out.append((D * group if owner.separable else (D @ group[..., None])[..., 0]).flatten(-2))
+        return _joined(out)
+
+    def outer(self, x: Tensor, y: Tensor, blocks: Blocks) -> Blocks:
+        """Return the entries of x y' where D1 has entries, summed to the shapes of `blocks`."""
+        out = []
+        for (owner, at, shape), D in zip(self._slices, blocks, strict=True):
+            a, b = self._group(x, at, shape), self._group(y, at, shape)
+            out.append((a * b if owner.separable else a[..., :, None] * b[..., None, :]).sum_to_size(D.shape))
+        return out
+
+    def spectral(self, blocks: Blocks) -> tuple[Tensor, Blocks]:
+        """Return the eigenvalues of D1, `(..., N)`, and its eigenvectors block by block (ones where it is diagonal)."""
+        values, vectors = [], []
+        for (owner, _, _), D in zip(self._slices, blocks, strict=True):
+            value, vector = (D, torch.ones_like(D)) if owner.separable else torch.linalg.eigh(D)
+            values.append(value.flatten(-2))
+            vectors.append(vector)
+        return _joined(values).clamp(0.0, 1.0), vectors
+
+    def rotate(self, vectors: Blocks, x: Tensor, *, back: bool = False) -> Tensor:
+        """Return W'x, W the eigenvectors, or W x, for x `(..., N)`."""
+        return self.apply([W if back or owner.separable else W.mT for (owner, _, _), W in self._with(vectors)], x)
+
+    def rotate_matrix(self, vectors: Blocks, G: Tensor) -> Tensor:
+        """Return W'G W, `(..., N, N)`."""
+        for (owner, at, shape), W in self._with(vectors):
+            if not owner.separable:
+                columns = G[..., at].unflatten(-1, shape)  # (..., N, groups, size)
+                turned = torch.einsum("...ngs,...gst->...ngt", columns, W).flatten(-2)
+                G = torch.cat(
+                    [x.expand(*turned.shape[:-1], -1) for x in (G[..., : at.start], turned, G[..., at.stop :])], -1
+                )
+        for (owner, at, shape), W in self._with(vectors):
+            if not owner.separable:
+                rows = G[..., at, :].unflatten(-2, shape)  # (..., groups, size, N)
+                turned = torch.einsum("...gsn,...gst->...gtn", rows, W).flatten(-3, -2)
+                G = torch.cat([G[..., : at.start, :], turned, G[..., at.stop :, :]], dim=-2)
+        return G
+
+    def _with(self, blocks: Blocks) -> Iterable[tuple[tuple[ConvexSet, slice, tuple[int, ...]], Tensor]]:
+        return zip(self._slices, blocks, strict=True)
+
+    @staticmethod
+    def _scale(gamma: Tensor | float, at: slice, shape: tuple[int, ...]) -> Tensor | float:
+        """Return gamma of each group, `(..., groups, 1)`."""
+        return gamma if isinstance(gamma, float) else gamma[..., at].unflatten(-1, shape)[..., :1]
+
+    @staticmethod
+    def _group(x: Tensor, at: slice, shape: tuple[int, ...]) -> Tensor:
+        return x[..., at].unflatten(-1, shape)
+
+
+def _snapshot(module: nn.Module) -> nn.Module:
+    """Return a copy that shares the tensors of a module, but not the places that hold them."""
+    copy = object.__new__(type(module))
+    copy.__dict__.update(module.__dict__)
+    copy.__dict__["_parameters"] = dict(module._parameters)
+    copy.__dict__["_buffers"] = dict(module._buffers)
+    copy.__dict__["_modules"] = {k: None if m is None else _snapshot(m) for k, m in module._modules.items()}
+    return copy
+
+
+def _joined(parts: list[Tensor]) -> Tensor:
+    """Concatenate the last dimension, batch dimensions broadcast."""
+    batch = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
+    return torch.cat([part.expand(*batch, -1) for part in parts], dim=-1)

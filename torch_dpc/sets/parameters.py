@@ -1,0 +1,31 @@
+"""The numbers and tensors that a set is made of."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import torch
+from torch import Tensor
+
+
+def as_bound(name: str, value: Any) -> Tensor | float:
+    """Keep a floating tensor as it is; anything else becomes a float or a float64 tensor."""
+    if isinstance(value, Tensor):
+        if not value.is_floating_point():
+            raise ValueError(f"`{name}` must hold floating-point numbers, got {value.dtype}.")
+        return value
+    try:
+        tensor = torch.as_tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"`{name}` must be a number or an array of numbers, got {value!r}.") from error
+    return tensor.item() if tensor.ndim == 0 else tensor
+
+
+def as_tensor(bound: Tensor | float) -> Tensor:
+    """Return a number or tensor as a tensor, with its graph."""
+    return bound if isinstance(bound, Tensor) else torch.tensor(bound, dtype=torch.float64)
+
+
+def short(bound: Tensor | float) -> str:
+    """Return a number as it is, a tensor by its shape."""
+    return f"tensor{tuple(bound.shape)}" if isinstance(bound, Tensor) else f"{bound:g}"

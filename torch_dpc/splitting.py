@@ -1,0 +1,212 @@
+"""The forward solve for any convex set with a projection.
+
+A solution is a zero of  F(lam) = v - P(v + gamma lam),  v = v0 - G lam.  A few steps of Douglas-Rachford splitting
+(Lions and Mercier 1979) come near, and semismooth Newton on F finishes: its step is the projected system of
+:mod:`torch_dpc.projected_system`. That is all for most problems. Where the rows that meet their bounds depend on each
+other Newton's system is singular, and the augmented Lagrangian of the least-distance form,
+
+    minimise 1/2 |x|^2   subject to   v = v0 + Ct x in the set,          x = -Ct' lam,
+
+takes over: each of its problems is smooth and strongly convex, so that Newton with a line search solves it from
+everywhere, and the multipliers converge for every convex set (Li, Sun, Toh 2018). Newton on F polishes the result.
+
+gamma is one number for each group of rows that a set constrains, the displacement that a unit of multiplier makes.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from .linear import times
+from .projected_system import solve_system
+from .sets.feasible import FeasibleSet
+
+#: Splitting steps before Newton.
+SPLITTING_STEPS = 20
+#: Newton's steps in one attempt, and how often a step is halved.
+NEWTON_STEPS, HALVINGS = 25, 12
+#: |F| relative to 1 + |v| at which a sample has converged.
+CONVERGED = 1e-13
+#: |F| above which, relative to 1 + |v|, a sample is worth another way.
+GOOD = 1e-10
+#: Penalties of the augmented Lagrangian, in units of 1 / gamma: the first, the largest, the growth; and its rounds.
+PENALTY, LARGEST_PENALTY, GROWTH, ROUNDS = 1.0, 1e6, 10.0, 60
+#: Newton steps on one augmented Lagrangian, the slope at which it is solved, and bisections of a line search.
+INNER_STEPS, FLAT, BISECTIONS = 40, 1e-12, 40
+#: What rounding leaves of a slope, relative to its terms.
+ROUNDING = 1e-15
+#: Newton steps up to which the penalty may grow.
+EASY = 20
+
+
+@dataclass
+class Found:
+    """Multipliers `(B, N)`, steps taken and |F| relative to 1 + |v|, each `(B,)`.
+
+    `gap` is the shortest way from the sets to the trajectories, `(B, N)`, as the augmented Lagrangian saw it last; it
+    does not vanish where there is no solution.
+    """
+
+    lam: Tensor
+    iterations: Tensor
+    residual: Tensor
+    gap: Tensor
+
+
+def scale_of(G: Tensor, sets: FeasibleSet) -> Tensor:
+    """Return gamma, `(N,)`, from the diagonal of G: the largest of each group, and of all problems."""
+    diagonal = G.diagonal(dim1=-2, dim2=-1)
+    diagonal = diagonal.reshape(-1, diagonal.shape[-1]).amax(0)
+    least = 1e-6 * diagonal.amax().clamp_min(torch.finfo(G.dtype).tiny)
+    return sets.largest_of_group(diagonal).clamp_min(float(least))
+
+
+def resolvent_of(G: Tensor, gamma: Tensor) -> Tensor:
+    """Return (G + diag gamma)^-1, which a step of the splitting needs, `(..., N, N)`."""
+    root = gamma.sqrt()
+    scaled = G / root[:, None] / root + torch.eye(len(root), dtype=G.dtype, device=G.device)
+    return torch.cholesky_inverse(torch.linalg.cholesky(scaled)) / root[:, None] / root
+
+
+def solve_convex(G: Tensor, Ct: Tensor, resolvent: Tensor, v0: Tensor, sets: FeasibleSet, gamma: Tensor) -> Found:
+    """Solve every sample.
+
+    Args:
+        G, Ct: `(N, N)` and `(N, n_x)`, or one a sample.
+        resolvent: of G and gamma, likewise.
+        v0: unconstrained minimisers, `(B, N)`; more batch dimensions where the sets have them.
+        sets: all sets, in part order like G and v0.
+        gamma: the scale of the multipliers, `(N,)`.
+    """
+    lam = _split(resolvent, v0, sets, gamma)
+    lam, iterations, residual = _newton(G, v0, sets, gamma, lam)
+    found = Found(lam, iterations + SPLITTING_STEPS, residual, torch.zeros_like(v0))
+    bad = residual > GOOD
+    if not bool(bad.any()):
+        return found
+    some = bad.nonzero()[:, 0] if v0.ndim == 2 and not sets.batch_shape else slice(None)
+    G_bad, Ct_bad = (m if m.ndim == 2 else m[some] for m in (G, Ct))
+    lam, steps, gap = _augmented_lagrangian(Ct_bad, v0[some], sets, gamma)
+    polished, more, size = _newton(G_bad, v0[some], sets, gamma, lam)
+    better = size < found.residual[some]
+    found.lam[some] = torch.where(better[..., None], polished, found.lam[some])
+    found.residual[some] = torch.where(better, size, found.residual[some])
+    found.iterations[some] += steps + more
+    found.gap[some] = gap
+    return found
+
+
+def _split(resolvent: Tensor, v0: Tensor, sets: FeasibleSet, gamma: Tensor) -> Tensor:
+    """Return multipliers after a few steps of Douglas-Rachford splitting."""
+    state = v0
+    for _ in range(SPLITTING_STEPS):
+        nearest = sets.prox(state, gamma)
+        behind = 2 * nearest - state
+        # The affine map's resolvent: (G + gamma) lam = v0 - behind, and v = behind + gamma lam.
+        state = nearest + gamma * times(resolvent, v0 - behind)
+    return (state - sets.prox(state, gamma)) / gamma
+
+
+def _residual(G: Tensor, v0: Tensor, sets: FeasibleSet, gamma: Tensor, lam: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return F, v + gamma lam, and |F| relative to 1 + |v|."""
+    v = v0 - times(G, lam)
+    x = v + gamma * lam
+    F = v - sets.prox(x, gamma)
+    norm = torch.linalg.vector_norm
+    return F, x, norm(F, dim=-1) / (1 + norm(v, dim=-1))
+
+
+def _newton(G: Tensor, v0: Tensor, sets: FeasibleSet, gamma: Tensor, lam: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Newton on F, steps halved until |F| shrinks; return multipliers, steps, and |F| relative to 1 + |v|."""
+    F, x, size = _residual(G, v0, sets, gamma, lam)
+    iterations = torch.zeros_like(size, dtype=torch.int64)
+    for _ in range(NEWTON_STEPS):
+        todo = size > CONVERGED
+        if not bool(todo.any()):
+            break
+        step, _ = solve_system(G, sets, sets.jacobians(x, gamma), F, gamma)
+        iterations = iterations + todo
+        length = todo.to(size)
+        for _ in range(HALVINGS):
+            trial = lam + length[..., None] * step
+            F_trial, x_trial, size_trial = _residual(G, v0, sets, gamma, trial)
+            longer = todo & ~(size_trial < (1 - 1e-4 * length) * size)
+            if not bool(longer.any()):
+                break
+            length = torch.where(longer, length / 2, length)
+        accept = (size_trial < size)[..., None]
+        if not bool(accept.any()):
+            break
+        lam, F, x = (torch.where(accept, new, old) for new, old in ((trial, lam), (F_trial, F), (x_trial, x)))
+        size = torch.where(accept[..., 0], size_trial, size)
+    return lam, iterations, size
+
+
+def _augmented_lagrangian(Ct: Tensor, v0: Tensor, sets: FeasibleSet, gamma: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """Return multipliers, Newton steps, and the way from the sets to the trajectories."""
+    lam, gap = torch.zeros_like(v0), torch.zeros_like(v0)
+    steps = torch.zeros(v0.shape[:-1], dtype=torch.int64, device=v0.device)
+    may_leave = v0.ndim == 2 and not sets.batch_shape
+    rest: Tensor | slice = torch.arange(len(v0), device=v0.device) if may_leave else slice(None)
+    x = v0.new_zeros(*v0.shape[:-1], Ct.shape[-1])
+    penalty = torch.full((*v0.shape[:-1], 1), PENALTY, dtype=v0.dtype, device=v0.device)
+    norm = torch.linalg.vector_norm
+    for _ in range(ROUNDS):
+        start, centre, C = lam[rest], v0[rest], Ct if Ct.ndim == 2 else Ct[rest]
+        reach = gamma / penalty  # the gamma of this round: w - P(w), over it, is the new multiplier
+        x, spent = _minimise(C, centre + reach * start, sets, reach, x)
+        w = centre + times(C, x) + reach * start
+        change = w - sets.prox(w, reach) - reach * start
+        lam[rest], gap[rest] = start + change / reach, change
+        steps[rest] += spent
+        stay = norm(change, dim=-1) > CONVERGED * (1 + norm(centre, dim=-1))
+        if not bool(stay.any()):
+            break
+        # A problem that took many steps is hard enough: multipliers that move closer make the next one easier.
+        grown = (GROWTH * penalty).clamp_max(LARGEST_PENALTY)
+        penalty = torch.where(spent[..., None] < EASY, grown, penalty)
+        penalty = torch.where(spent[..., None] == INNER_STEPS, penalty / GROWTH, penalty)
+        if may_leave:
+            rest, x, penalty = rest[stay], x[stay], penalty[stay]  # type: ignore[index]
+    return lam, steps, gap
+
+
+def _minimise(Ct: Tensor, shift: Tensor, sets: FeasibleSet, reach: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
+    """Minimise 1/2 |x|^2 + 1/2 |w - P(w)|^2 / reach, w = shift + Ct x: slope and curvature come from P and D alone."""
+
+    def slope(x: Tensor) -> tuple[Tensor, Tensor]:
+        w = shift + times(Ct, x)
+        return x + times(Ct.mT, (w - sets.prox(w, reach)) / reach), w
+
+    gradient, w = slope(x)
+    steps = torch.zeros(x.shape[:-1], dtype=torch.int64, device=x.device)
+    norm = torch.linalg.vector_norm
+    eye = torch.eye(Ct.shape[-1], dtype=Ct.dtype, device=Ct.device)
+    size = norm(gradient, dim=-1)
+    rounding = ROUNDING * torch.linalg.matrix_norm(Ct)
+    for _ in range(INNER_STEPS):
+        floor = FLAT * (size + norm(x, dim=-1)) + rounding * norm(w / reach, dim=-1)
+        todo = norm(gradient, dim=-1) > floor
+        if not bool(todo.any()):
+            break
+        curved = sets.complement_times(sets.jacobians(w, reach), Ct) / reach[..., None]
+        L, _ = torch.linalg.cholesky_ex(eye + Ct.mT @ curved)
+        step = -torch.cholesky_solve(gradient[..., None], L)[..., 0] * todo[..., None]
+        steps = steps + todo
+        # The slope along the step grows from below zero: the minimum is where it vanishes, and 1 is tried first.
+        low, high = torch.zeros_like(steps, dtype=x.dtype), torch.ones_like(steps, dtype=x.dtype)
+        start, length = (gradient * step).sum(-1), high
+        for _ in range(BISECTIONS):
+            trial = x + length[..., None] * step
+            gradient_trial, w_trial = slope(trial)
+            along = (gradient_trial * step).sum(-1)
+            too_far, too_short = along > 0.1 * start.abs(), (along < -0.5 * start.abs()) & (length < 1)
+            if not bool((todo & (too_far | too_short)).any()):
+                break
+            high, low = torch.where(too_far, length, high), torch.where(too_short, length, low)
+            length = torch.where(too_far | too_short, (low + high) / 2, length)
+        x, gradient, w = trial, gradient_trial, w_trial
+    return x, steps

@@ -1,0 +1,124 @@
+"""The weights of the problem: what a caller may give, checked, as tensors of the whole horizon."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+#: Asymmetry of Q or R, relative to its largest entry, up to which it is rounding and is averaged away.
+ASYMMETRY = 1e-6
+#: An eigenvalue of Q or R below minus this fraction of the largest makes the matrix indefinite.
+NEGATIVE_EIGENVALUE = 1e-9
+
+
+@dataclass(frozen=True, eq=False)
+class Weights:
+    """The weights as tensors; leading dimensions, if any, are one problem each.
+
+    Attributes:
+        Q: output weight, `(..., horizon n_y, horizon n_y)`.
+        R: input weight, `(..., horizon n_u, horizon n_u)`.
+        lambda_g, lambda_s: regularisation of g and of the initial output, `(...)`.
+        lambda_u: penalty on the mismatch of the initial input, `(...)`; None where that is exact.
+        R_du: weight of the changes of the input, like R; None where they are not charged.
+    """
+
+    Q: Tensor
+    R: Tensor
+    lambda_g: Tensor
+    lambda_s: Tensor
+    lambda_u: Tensor | None = None
+    R_du: Tensor | None = None
+
+    #: Dimensions of each weight that are its own; those before them are the batch.
+    TAILS = {"Q": 2, "R": 2, "lambda_g": 0, "lambda_s": 0, "lambda_u": 0, "R_du": 2}
+
+    @property
+    def tensors(self) -> dict[str, Tensor]:
+        """The weights that there are, by name."""
+        return {name: getattr(self, name) for name in self.TAILS if getattr(self, name) is not None}
+
+    @property
+    def are_batched(self) -> bool:
+        """Whether one of them has a batch dimension."""
+        return any(tensor.ndim > self.TAILS[name] for name, tensor in self.tensors.items())
+
+    def map(self, change: Any) -> Weights:
+        """Return the weights with `change(tensor, own dimensions)` in place of each."""
+        return Weights(**{name: change(tensor, self.TAILS[name]) for name, tensor in self.tensors.items()})
+
+
+def weight_matrix(name: str, value: Any, channels: int, horizon: int) -> Tensor:
+    """Return Q or R of the whole horizon, `(..., horizon n, horizon n)` in float64, symmetric; a graph is kept.
+
+    Args:
+        name: "Q" or "R", for messages.
+        value: a number, one step's `(..., n, n)`, or the whole horizon's `(..., horizon n, horizon n)`.
+        channels: n.
+        horizon: steps of the plan.
+
+    Raises:
+        ValueError: another shape, asymmetry above rounding, or a negative eigenvalue.
+    """
+    matrix = as_weight(name, value)
+    if matrix.ndim == 0:
+        matrix = matrix * torch.eye(channels, dtype=matrix.dtype, device=matrix.device)
+    size = channels * horizon
+    if matrix.ndim < 2 or matrix.shape[-2:] not in {(channels, channels), (size, size)}:
+        raise ValueError(
+            f"`{name}` must be a number or have shape ({channels}, {channels}) for one step or ({size}, {size}) for "
+            f"the whole horizon, got {tuple(matrix.shape)}."
+        )
+    transposed = matrix.mT
+    with torch.no_grad():
+        largest = matrix.abs().amax()
+        asymmetry = (matrix - transposed).abs().amax()
+        if asymmetry > ASYMMETRY * largest:
+            raise ValueError(f"`{name}` must be symmetric, got entries that differ by {float(asymmetry):.1e}.")
+        smallest = torch.linalg.eigvalsh((matrix + transposed) / 2).amin()
+        if smallest < -NEGATIVE_EIGENVALUE * largest:
+            raise ValueError(f"`{name}` must be positive semidefinite, got an eigenvalue of {float(smallest):.1e}.")
+    matrix = (matrix + transposed) / 2
+    if matrix.shape[-1] == size:
+        return matrix
+    steps = torch.eye(horizon, dtype=matrix.dtype, device=matrix.device)
+    return torch.einsum("st,...ij->...sitj", steps, matrix).reshape(*matrix.shape[:-2], size, size)
+
+
+def penalty(name: str, value: Any) -> Tensor:
+    """Return lambda_g or lambda_s as float64, `(...)`; a graph is kept.
+
+    Raises:
+        ValueError: a negative value.
+    """
+    number = as_weight(name, value)
+    if bool((number.detach() < 0).any()):
+        raise ValueError(f"`{name}` must not be negative, got {float(number.detach().min()):g}.")
+    return number
+
+
+def as_weight(name: str, value: Any) -> Tensor:
+    """Return a weight as a finite float64 tensor; a graph is kept."""
+    if isinstance(value, bool):
+        raise ValueError(f"`{name}` must be a number or a tensor, got {value!r}.")
+    if isinstance(value, Tensor):
+        if not value.is_floating_point():
+            raise ValueError(f"`{name}` must hold floating-point numbers, got {value.dtype}.")
+        tensor = value.double()
+    else:
+        try:
+            tensor = torch.as_tensor(value, dtype=torch.float64)
+        except (TypeError, ValueError, RuntimeError) as error:
+            raise ValueError(f"`{name}` must be a number or a tensor, got {value!r}.") from error
+    if not bool(torch.isfinite(tensor.detach()).all()):
+        raise ValueError(f"`{name}` must be finite, got {tensor.detach().tolist()}.")
+    return tensor
+
+
+def psd_root(matrix: Tensor) -> Tensor:
+    """Return S with S'S = matrix, for a symmetric positive semidefinite matrix `(..., n, n)`."""
+    values, vectors = torch.linalg.eigh(matrix)
+    return values.clamp_min(0.0).sqrt()[..., None] * vectors.mT
