@@ -137,15 +137,17 @@ def picture(path: Path, rows: Rows, curves: Rows, rhos: Sequence[float]) -> None
         title="held-out windows", xscale="log", xlabel="time a sample [µs]", ylabel="decrease of psi / Algorithm 1's"
     )
     setting = next(s for s in dict.fromkeys(rows["setting"]) if s != HELD_OUT_WINDOWS)
+    percents = [100 * rho for rho in rhos]
     for name in names_in(rows, setting):
-        errors = np.array([chosen(rows, "mean_error", setting, name, rho) for rho in rhos])
-        right.plot(100 * np.array(rhos), errors.mean(axis=1), label=TITLES[name], **LOOKS[name])
-        right.fill_between(
-            100 * np.array(rhos), errors.min(axis=1), errors.max(axis=1), color=LOOKS[name]["color"], alpha=0.15
-        )
-    nominal = chosen(rows, "mean_error", setting, NOMINAL, 0.0).mean()
-    right.axhline(nominal, color=COLOURS[NOMINAL], linestyle=(0, (4, 2)), label=TITLES[NOMINAL])
-    right.set(title=f"closed loop, {setting}", xlabel=r"$\rho$ [%]", ylabel="mean tracking error [m]", ylim=(0, None))
+        if name != RANDOM:  # far below the others
+            error, base = (
+                np.array([chosen(rows, "mean_error", setting, n, rho) for rho in rhos]) for n in (name, POISON)
+            )
+            ratio = error / base
+            right.plot(percents, error.mean(axis=1) / base.mean(axis=1), label=TITLES[name], **LOOKS[name])
+            right.fill_between(percents, ratio.min(axis=1), ratio.max(axis=1), color=LOOKS[name]["color"], alpha=0.12)
+    right.set(title=f"closed loop, {setting}", xlabel=r"$\rho$ [%]", ylabel="error / Algorithm 1's")
+    right.set_xticks(percents)
     handles = {
         label: line for axes in (middle, right) for line, label in zip(*axes.get_legend_handles_labels(), strict=True)
     }
