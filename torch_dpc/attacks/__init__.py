@@ -4,11 +4,14 @@ from .budgets import Ball, Box, Budget, Ellipsoid, L1Ball, PerChannel, RelativeB
 from .costs import Cost, TargetInput, TrackingError
 from .gradient import LinearizedAttack
 from .iterative import FrankWolfeAttack, ProjectedGradientAttack
+from .network import AttackPolicy
+from .policy import PolicyAttack
 from .predictor import Predictor
 from .query import FiniteDifferenceAttack, RandomSearchAttack
 from .random import RandomAttack
 
 __all__ = [
+    "AttackPolicy",
     "Ball",
     "Box",
     "Budget",
@@ -19,6 +22,7 @@ __all__ = [
     "L1Ball",
     "LinearizedAttack",
     "PerChannel",
+    "PolicyAttack",
     "Predictor",
     "ProjectedGradientAttack",
     "RandomAttack",
