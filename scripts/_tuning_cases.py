@@ -58,7 +58,9 @@ class Case:
         rho: of the attack that is tuned against.
         rhos: the paper's.
         channels: whose error counts.
-        plans: of a run in the objective, `REPLAN_EVERY` steps each.
+        plans: of a run in the objective, `replan_every` steps each.
+        steps: of a run in closed loop.
+        replan_every: steps of a plan that are applied.
         other_target: an input [N, m/s] that an attacker wants against whom nothing was tuned.
     """
 
@@ -70,6 +72,7 @@ class Case:
     channels: list[int]
     plans: int
     steps: int
+    replan_every: int = 10
     other_target: Tensor
     experiment: Any
 
@@ -139,7 +142,7 @@ class Case:
         """Run in closed loop and sum up."""
         log = self.simulate(plant, layer, seed, self.attack(kind, rho, layer))
         error = torch.linalg.vector_norm((log.y - log.y_ref)[:, self.channels], dim=1)
-        unsolved = (log.status != dpc.Status.SOLVED)[:: self.experiment.REPLAN_EVERY].sum()
+        unsolved = (log.status != dpc.Status.SOLVED)[:: self.replan_every].sum()
         return Run(float(error.mean()), float(error.max()), int(unsolved))
 
     def objectives(self, plant: Any, start: Weights, **options: Any) -> list[tuning.RobustObjective]:
@@ -155,7 +158,7 @@ class Case:
                 predictor=predictor,
                 cost=tuning.MeanError(self.channels),
                 plans=self.plans,
-                replan_every=self.experiment.REPLAN_EVERY,
+                replan_every=self.replan_every,
                 **options,
             )
             for data, windows, starts in recordings
@@ -185,7 +188,7 @@ class Case:
             pieces += [(log.u[k - t_ini : k], log.y[k - t_ini : k]) for k in starts.tolist()]
         u_ini, y_ini = (torch.stack(part) for part in zip(*pieces, strict=True))
         starts = starts.repeat(2)
-        length = self.plans * self.experiment.REPLAN_EVERY + self.experiment.HORIZON
+        length = self.plans * self.replan_every + self.experiment.HORIZON
         rows = starts[:, None] + torch.arange(length)
         y_ref, u_ref = self.references(int(rows.max()) + 1)
         return tuning.Windows(u_ini, y_ini, y_ref[rows], None if u_ref is None else u_ref[rows]), starts
@@ -233,7 +236,7 @@ class Masses(Case):
         y_ref, u_ref = self.references(self.steps + f.HORIZON)
         return dpc.simulate(
             plant,
-            dpc.DPCController(layer, f.REPLAN_EVERY, on_failure="hold"),
+            dpc.DPCController(layer, self.replan_every, on_failure="hold"),
             y_ref,
             steps=self.steps,
             u_ref=u_ref,
@@ -258,7 +261,7 @@ class Masses(Case):
 
 
 class MovingMasses(Masses):
-    """The masses follow a sinusoid from wherever they start, and every measurement, recorded or in the run, has noise."""
+    """The masses follow a sinusoid from wherever they start, and every measurement, recorded or not, has noise."""
 
     name, title = "moving", f"masses on a sinusoid, noise of {NOISE:g} m"
     channels = [0, 1]
@@ -305,7 +308,7 @@ class Quadrotor(Case):
         f = figure4_quadrotor
         return dpc.simulate(
             plant,
-            dpc.DPCController(layer, f.REPLAN_EVERY, on_failure="hold"),
+            dpc.DPCController(layer, self.replan_every, on_failure="hold"),
             f.circle(self.steps + f.HORIZON),
             steps=self.steps,
             attack=attack,

@@ -61,8 +61,8 @@ def write_report(stem: Path, cases: Sequence[Case], points: Rows, course: Rows, 
         "# Weights that hold under attack",
         "",
         f"{note}. Errors are means over a run in closed loop [m], then over held-out recordings, with the smallest and "
-        "the largest recording in brackets; the attacker knows the weights. A point dominates when its attacked error is "
-        f"below the paper's by {1 - LOWER:.0%} or more, at no more than {ALLOWED - 1:.0%} more nominal error.",
+        "the largest recording in brackets; the attacker knows the weights. A point dominates when its attacked error "
+        f"is below the paper's by {1 - LOWER:.0%} or more, at no more than {ALLOWED - 1:.0%} more nominal error.",
     ]
     for case in cases:
         lines += ["", *case_lines(case, points, runs)]
@@ -74,8 +74,8 @@ def case_lines(case: Case, points: Rows, runs: Rows) -> list[str]:
     chosen, mine = choose(points, runs, case), [row for row in points if row["case"] == case.name]
     lines = [f"## {case.title[0].upper()}{case.title[1:]}, Algorithm 1 at {percent(case.rho)}", ""]
     lines += [
-        "| weights | attacked weight | evaluations | CPU [s] | objective | no attack | Algorithm 1 | times the paper's | "
-        "recordings with less | dominates |",
+        "| weights | attacked weight | evaluations | CPU [s] | objective | no attack | Algorithm 1 | "
+        "times the paper's | recordings with less | dominates |",
         "|---|---|---|---|---|---|---|---|---|---|",
         "| the paper's | | | | | " + " | ".join(map(cell, pair(runs, case, "paper"))) + " | | | |",
     ]
@@ -105,9 +105,9 @@ def best_of_grid(case: Case, runs: Rows) -> str:
     best = min(fits, key=lambda name: fits[name])
     _, g, s = best.split()
     return (
-        f"On the grid of {len(names)} pairs of lambda_g and lambda_s with the paper's Q and R ({seeds} recordings), the least "
-        f"attacked error within {ALLOWED - 1:.0%} more nominal error is {fits[best]:.4f} m, at lambda_g = {float(g):g} and "
-        f"lambda_s = {float(s):g}; the paper's weights have {paper[1]:.4f} m there."
+        f"On the grid of {len(names)} pairs of lambda_g and lambda_s with the paper's Q and R ({seeds} recordings), the "
+        f"least attacked error within {ALLOWED - 1:.0%} more nominal error is {fits[best]:.4f} m, at "
+        f"lambda_g = {float(g):g} and lambda_s = {float(s):g}; the paper's weights have {paper[1]:.4f} m there."
     )
 
 
@@ -115,7 +115,7 @@ def other_attacks(case: Case, chosen: str, runs: Rows) -> list[str]:
     """Return the table of attacks that were not tuned against, beside the one that was."""
     target = ", ".join(f"{v:g}" for v in case.other_target.tolist())
     lines = [
-        f"Other attacks on the paper's and on the chosen weights; another target is Algorithm 1 towards u = ({target}):",
+        f"Other attacks on the paper's and the chosen weights; another target is Algorithm 1 towards u = ({target}):",
         "",
         "| attack | rho | the paper's | chosen | ratio |",
         "|---|---|---|---|---|",
