@@ -105,8 +105,8 @@ def best_of_grid(case: Case, runs: Rows) -> str:
     best = min(fits, key=lambda name: fits[name])
     _, g, s = best.split()
     return (
-        f"On the grid of {len(names)} pairs of lambda_g and lambda_s with the paper's Q and R ({seeds} recordings), the "
-        f"least attacked error within {ALLOWED - 1:.0%} more nominal error is {fits[best]:.4f} m, at "
+        f"On the grid of {len(names)} pairs of lambda_g and lambda_s with the paper's Q and R ({seeds} recordings), "
+        f"the least attacked error within {ALLOWED - 1:.0%} more nominal error is {fits[best]:.4f} m, at "
         f"lambda_g = {float(g):g} and lambda_s = {float(s):g}; the paper's weights have {paper[1]:.4f} m there."
     )
 
