@@ -27,10 +27,17 @@ class Lost(RuntimeError):
 
 
 class Backend:
-    """One of joblib's backends, and what it raises when workers die."""
+    """One of joblib's backends.
 
-    def __init__(self, name: str, lost: tuple[type[BaseException], ...], **options: Any):
-        self.name, self.lost, self.options = name, lost, options
+    Args:
+        name: joblib's name of it.
+        lost: what it raises when workers die.
+        streams: whether it hands out results as they finish; if not, they come in rounds of one chunk a worker.
+        options: of joblib's `parallel_config`.
+    """
+
+    def __init__(self, name: str, lost: tuple[type[BaseException], ...], *, streams: bool = True, **options: Any):
+        self.name, self.lost, self.streams, self.options = name, lost, streams, options
 
     def run(self, chunks: list[list[RunConfig]]) -> Iterator[list[dict[str, Any]]]:
         """Yield the rows of each chunk as it finishes.
@@ -39,9 +46,12 @@ class Backend:
             Lost: workers died; chunks that have not been yielded are to be run again.
         """
         with joblib.parallel_config(backend=self.name, **self.options):
-            parallel = joblib.Parallel(return_as="generator_unordered", batch_size=1)
+            size = len(chunks) if self.streams else joblib.effective_n_jobs()
+            kind = "generator_unordered" if self.streams else "list"
             try:
-                yield from parallel(joblib.delayed(run_chunk)(chunk) for chunk in chunks)
+                for i in range(0, len(chunks), size):
+                    parallel = joblib.Parallel(return_as=kind, batch_size=1)
+                    yield from parallel(joblib.delayed(run_chunk)(chunk) for chunk in chunks[i : i + size])
             except self.lost as error:
                 raise Lost(type(error).__name__) from error
 
@@ -72,7 +82,7 @@ def open_backend(name: str, scheduler: str | None, workers: int) -> Iterator[Bac
         ray.init(address=scheduler, runtime_env={"py_modules": [str(SCRIPTS)]}, log_to_driver=False)
         register_ray()
         try:
-            yield Backend("ray", (ray.exceptions.RayError,), n_jobs=-1)
+            yield Backend("ray", (ray.exceptions.RayError,), streams=False, n_jobs=-1)
         finally:
             ray.shutdown()
 

@@ -21,6 +21,7 @@ LOOKS = {
     "lambdas": ("#009e73", "D"),
     "tpe": ("#cc79a7", "^"),
     "cmaes": ("#e69f00", "v"),
+    "both": ("#56b4e9", "P"),
 }
 ATTACKS = {"nominal": "no attack", "random": "random noise", "algorithm1": "Algorithm 1", "other": "another target"}
 Rows = list[dict[str, str]]

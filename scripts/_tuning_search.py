@@ -22,6 +22,7 @@ METHODS = {
     ONLY_LAMBDAS: "gradient, lambda_g and lambda_s only",
     "tpe": "Optuna, TPE",
     "cmaes": "Optuna, CMA-ES",
+    "both": "Optuna, TPE, for half the time, then the gradient",
 }
 
 
@@ -38,6 +39,11 @@ class Found(NamedTuple):
         """The row of the best evaluation."""
         return min(self.history, key=lambda row: row["total"])
 
+    @property
+    def seconds(self) -> float:
+        """Processor time of the whole search."""
+        return self.history[-1]["seconds"]
+
 
 def searches(case_name: str, attacked_weight: float, methods: Sequence[str], steps: int = STEPS) -> list[Found]:
     """Run several searches one after the other; Optuna's have the processor time that the first one took."""
@@ -50,28 +56,35 @@ def searches(case_name: str, attacked_weight: float, methods: Sequence[str], ste
             through = "danskin" if method == "danskin" else "attack"
             objectives = case.objectives(plant, start, attacked_weight=attacked_weight, through=through)
             if method in ("tpe", "cmaes"):
-                layer, history = by_optuna(objectives, method, found[0].history[-1]["seconds"])
+                scales, history = by_optuna(objectives, method, found[0].seconds)
+            elif method == "both":
+                scales, first = by_optuna(objectives, "tpe", found[0].seconds / 2)
+                scales, second = by_gradient(objectives, scales, steps // 2)
+                history = [*first, *({**row, "evaluation": len(first) + row["evaluation"]} for row in second)]
+                for row in history[len(first) :]:
+                    row["seconds"] += first[-1]["seconds"]
             else:
-                layer, history = by_gradient(objectives, method == ONLY_LAMBDAS, steps)
-            found.append(Found(method, attacked_weight, Weights.of(layer), history))
+                scales = tuning.WeightScales(objectives[0].layer)
+                for free in (scales.Q, scales.R):
+                    free.requires_grad_(method != ONLY_LAMBDAS)
+                scales, history = by_gradient(objectives, scales, steps)
+            weights = Weights.of(scales.apply_to(objectives[0].layer))
+            found.append(Found(method, attacked_weight, weights, history))
     return found
 
 
 def by_gradient(
-    objectives: list[tuning.RobustObjective], only_lambdas: bool, steps: int
-) -> tuple[Any, list[dict[str, float]]]:
-    """Tune by the gradient, and return the layer and the course."""
-    scales = tuning.WeightScales(objectives[0].layer)
-    scales.Q.requires_grad_(not only_lambdas)
-    scales.R.requires_grad_(not only_lambdas)
+    objectives: list[tuning.RobustObjective], start: tuning.WeightScales, steps: int
+) -> tuple[tuning.WeightScales, list[dict[str, float]]]:
+    """Tune by the gradient, and return the best scales and the course."""
     course = _Course()
-    result = tuning.tune(objectives, steps=steps, lr=RATE, scales=scales, limit=LIMIT, progress=course.add)
-    return result.layer, course.rows
+    result = tuning.tune(objectives, steps=steps, lr=RATE, scales=start, limit=LIMIT, progress=course.add)
+    return result.scales, course.rows
 
 
 def by_optuna(
     objectives: list[tuning.RobustObjective], sampler: str, seconds: float
-) -> tuple[Any, list[dict[str, float]]]:
+) -> tuple[tuning.WeightScales, list[dict[str, float]]]:
     """Tune by one of Optuna's samplers for so much processor time, its own included, from the same start.
 
     The first logarithm of R is left at 0, which takes the common factor out of the search.
@@ -110,7 +123,7 @@ def by_optuna(
     study.enqueue_trial({name: 0.0 for i, name in enumerate(names) if i != pinned})
     study.optimize(value, callbacks=[stop])
     set_to(study.best_params)
-    return scales.apply_to(objectives[0].layer), course.rows
+    return scales, course.rows
 
 
 class _Course:

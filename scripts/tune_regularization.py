@@ -44,7 +44,7 @@ QUICK_STEPS = 5
 
 def search_jobs(case: str) -> list[tuple[str, float, tuple[str, ...]]]:
     """Return the searches of one case; those of Optuna follow the one whose time they are given."""
-    jobs: list[tuple[str, float, tuple[str, ...]]] = [(case, 1.0, ("attack", "tpe", "cmaes"))]
+    jobs: list[tuple[str, float, tuple[str, ...]]] = [(case, 1.0, ("attack", "tpe", "cmaes", "both"))]
     jobs += [(case, w, ("attack",)) for w in ATTACKED_WEIGHTS if w != 1.0]
     return [*jobs, (case, 1.0, ("danskin",)), (case, 1.0, (ONLY_LAMBDAS,))]
 
@@ -149,7 +149,7 @@ def tune_plant(plant: str, out: Path, seeds: int, workers: int, steps: int = STE
                 continue
             course.add({"case": case, "point": name, **row} for row in result.history)
             head = {"case": case, "point": name, "method": result.method, "attacked_weight": result.attacked_weight}
-            cost = {"evaluations": len(result.history), "seconds": result.history[-1]["seconds"]}
+            cost = {"evaluations": len(result.history), "seconds": result.seconds}
             points.add([{**head, **cost, "total": result.best["total"], **point_columns(result.weights)}])
 
     jobs = []
