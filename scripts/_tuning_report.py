@@ -7,6 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from matplotlib.ticker import LogLocator, NullLocator
 
 from _plots import percent, plt, style
 from _tuning_cases import Case
@@ -23,6 +24,7 @@ LOOKS = {
     "cmaes": ("#e69f00", "v"),
     "both": ("#56b4e9", "P"),
 }
+SHADE = "#009e73"
 ATTACKS = {"nominal": "no attack", "random": "random noise", "algorithm1": "Algorithm 1", "other": "another target"}
 Rows = list[dict[str, str]]
 
@@ -156,14 +158,18 @@ def cell(values: np.ndarray) -> str:
 
 
 def draw(path: Path, cases: Sequence[Case], points: Rows, course: Rows, runs: Rows) -> None:
-    """Draw the front above and the course of the searches below, one column a case."""
+    """Draw the front and the course of the searches of each case."""
     style()
-    size = (4.4 * max(len(cases), 1.2), 7.0)
-    figure, panels = plt.subplots(2, len(cases), figsize=size, squeeze=False)
-    for (front, descent), case in zip(panels.T, cases, strict=True):
+    if len(cases) == 1:
+        figure, panels = plt.subplots(1, 2, figsize=(8.6, 4.6))
+        columns = [tuple(panels)]
+    else:
+        figure, panels = plt.subplots(2, len(cases), figsize=(4.4 * len(cases), 7.2))
+        columns = list(panels.T)
+    for (front, descent), case in zip(columns, cases, strict=True):
         draw_front(front, case, points, runs)
         draw_course(descent, case, course)
-    handles, labels = panels[0, 0].get_legend_handles_labels()
+    handles, labels = columns[-1][0].get_legend_handles_labels()
     figure.legend(handles, labels, loc="outside upper center", ncols=2, fontsize=9)
     figure.savefig(path)
     plt.close(figure)
@@ -171,35 +177,63 @@ def draw(path: Path, cases: Sequence[Case], points: Rows, course: Rows, runs: Ro
 
 def draw_front(axes: Any, case: Case, points: Rows, runs: Rows) -> None:
     """Draw nominal against attacked error on the held-out recordings."""
-    names = sorted({r["point"] for r in runs if r["case"] == case.name and r["point"].startswith("grid")})
-    backdrop = np.array([[e.mean() for e in pair(runs, case, name)] for name in names])
-    paper = [e.mean() for e in pair(runs, case, "paper")]
-    axes.plot(*backdrop.T, ".", color="0.6", label=r"grid over $\lambda_g$, $\lambda_s$, the paper's Q and R")
-    axes.plot(*paper, "*", color="black", markersize=13, label="the paper's weights")
-    tuned = []
-    for method, (colour, marker) in LOOKS.items():
-        some = [row["point"] for row in points if row["case"] == case.name and row["method"] == method]
-        means = np.array([[e.mean() for e in pair(runs, case, name)] for name in some])
-        tuned.append(means)
-        name = METHODS[method].replace("lambda_g", r"$\lambda_g$").replace("lambda_s", r"$\lambda_s$")
-        axes.plot(*means.T, marker, color=colour, markeredgecolor="white", markersize=8, label=name)
-    limit = allowed(runs, case, "held out")
-    everything = np.concatenate([*tuned, [paper]])
-    axes.set(title=case.title, xlabel="error without attack [m]")
-    axes.set_ylabel(f"error under Algorithm 1 at {percent(case.rho)} [m]")
-    if paper[0] > ZERO:
-        span = max(2.2 * limit, 1.15 * everything[:, 0].max())
-        axes.set(xlim=(0, span), ylim=(0, 1.25 * max(everything[:, 1].max(), paper[1])))
-        axes.fill_between([0, limit], 0, paper[1], color="#009e73", alpha=0.1, linewidth=0)
-        axes.text(0.02 * span, 0.97 * paper[1], "dominates", va="top", fontsize=9, color="#00664a")
-    else:
-        axes.set(xlim=(-0.2, 1), xticks=[0], ylim=(0, 1.25 * paper[1]))
+    groups = {"grid": sorted({r["point"] for r in runs if r["case"] == case.name and r["point"].startswith("grid")})}
+    groups["paper"] = ["paper"]
+    for method in LOOKS:
+        names = [row["point"] for row in points if row["case"] == case.name and row["method"] == method]
+        if names:
+            groups[method] = names
+    means = {key: np.array([[e.mean() for e in pair(runs, case, n)] for n in names]) for key, names in groups.items()}
+    nominal, attacked = means["paper"][0]
+    axes.set(title=case.title, ylabel=f"error under Algorithm 1 at {percent(case.rho)} [m]")
+    if nominal > ZERO:
+        spread_of = np.concatenate(list(means.values()))
+        shade(axes, allowed(runs, case, "held out"), attacked, spread_of)
+        axes.set_xlabel("error without attack [m]")
+    else:  # one value for all: side by side
+        for i, values in enumerate(means.values()):
+            values[:, 0] = i
+        axes.axhspan(0, attacked, color=SHADE, alpha=0.1, linewidth=0)
+        axes.set(xlabel="error without attack: 0 for all", xticks=[], ylim=(0, 1.25 * attacked))
+    for key, values in means.items():
+        axes.plot(*values.T, **look(key))
+
+
+def shade(axes: Any, limit: float, attacked: float, points: np.ndarray) -> None:
+    """Set the axes, logarithmic where the points are far apart, and shade where a point dominates."""
+    wide = points.max(axis=0) > 5 * points.min(axis=0)
+    low = np.where(wide, 0.7 * points.min(axis=0), 0.0)
+    high = np.where(wide, 1.4 * points.max(axis=0), 1.15 * points.max(axis=0))
+    for axis, name in enumerate("xy"):
+        axes.set(**{f"{name}scale": "log" if wide[axis] else "linear", f"{name}lim": (low[axis], high[axis])})
+        if wide[axis]:
+            scale = getattr(axes, f"{name}axis")
+            scale.set_major_locator(LogLocator(subs=(1.0, 2.0, 5.0)))
+            scale.set_minor_locator(NullLocator())
+            scale.set_major_formatter(lambda value, _: f"{value:g}")
+    axes.fill_between([low[0], limit], low[1], attacked, color=SHADE, alpha=0.1, linewidth=0)
+    axes.annotate("dominates", (low[0], low[1]), (6, 6), textcoords="offset points", fontsize=9, color="#00664a")
+
+
+def look(group: str) -> dict[str, Any]:
+    """Return how the points of a group are drawn."""
+    if group == "grid":
+        label = r"grid over $\lambda_g$, $\lambda_s$, the paper's Q and R"
+        return {"linestyle": "", "marker": ".", "color": "0.6", "label": label}
+    if group == "paper":
+        return {"linestyle": "", "marker": "*", "color": "black", "markersize": 13, "label": "the paper's weights"}
+    colour, marker = LOOKS[group]
+    label = METHODS[group].replace("lambda_g", r"$\lambda_g$").replace("lambda_s", r"$\lambda_s$")
+    edge = {"markeredgecolor": "white", "markersize": 8}
+    return {"linestyle": "", "marker": marker, "color": colour, "label": label, **edge}
 
 
 def draw_course(axes: Any, case: Case, course: Rows) -> None:
     """Draw the best objective so far against the processor time, for equal weights of both costs."""
     for method, (colour, _) in LOOKS.items():
         rows = [row for row in course if row["case"] == case.name and row["point"] == f"{method} 1"]
+        if not rows:
+            continue
         last = {int(row["evaluation"]): row for row in rows}  # a search that was killed may have left rows
         seconds = [float(row["seconds"]) for row in last.values()]
         best = np.minimum.accumulate([float(row["total"]) for row in last.values()])

@@ -12,8 +12,8 @@ import torch
 from _tuning_cases import CASES, Weights
 from torch_dpc import tuning
 
-STEPS, RATE = 60, 0.2  # of Adam
-LIMIT = math.log(1e4)  # how far each logarithm may move
+STEPS, RATE = 60, 0.4  # of Adam
+LIMIT = math.log(1e3)  # how far each logarithm may move
 ATTACKED_WEIGHTS = (0.3, 1.0, 3.0)
 ONLY_LAMBDAS = "lambdas"
 METHODS = {

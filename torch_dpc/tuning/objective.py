@@ -157,7 +157,9 @@ class RobustObjective:
     def _attacker(self, planner: DPCLayer, weights: dict[str, Tensor]) -> Callable[..., Tensor]:
         if self.through == "attack" and torch.is_grad_enabled():
             return Attacker(planner, self.budget, self._psi, self.iterations, keeps_graph=True)
-        constant = with_weights(_FactoredOnce, self.layer, {name: w.detach() for name, w in weights.items()})
+        constant = planner
+        if any(w.requires_grad for w in weights.values()):
+            constant = with_weights(_FactoredOnce, self.layer, {name: w.detach() for name, w in weights.items()})
         if self.attack is not None:
             return self.attack(constant)
         return Attacker(constant, self.budget, self._psi, self.iterations)
