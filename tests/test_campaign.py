@@ -223,6 +223,19 @@ def test_a_killed_dask_worker_loses_nothing(small, tmp_path, monkeypatch, cluste
     assert store.kill is None and is_complete(store, configs)
 
 
+@pytest.mark.slow
+def test_ray_gives_the_same_rows(small, tmp_path):
+    ray = pytest.importorskip("ray", reason="needs Ray, which `make` leaves out: pip install ray")
+    ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
+    try:
+        address = ray.get_runtime_context().gcs_address
+        command = [sys.executable, SCRIPTS / "campaign.py", small, "--out", tmp_path]
+        subprocess.run([*command, "--backend", "ray", "--scheduler", address], stderr=subprocess.DEVNULL, check=True)
+    finally:
+        ray.shutdown()
+    assert is_complete(Store(tmp_path / "campaign_small"), config.load(small))
+
+
 # --- bad input ------------------------------------------------------------------------------------------------------
 
 
