@@ -108,12 +108,7 @@ class RobustObjective:
         self.attacked_weight, self.through = attacked_weight, through
         self.predictor = DataPredictor(layer.data) if predictor is None else predictor
         self.cost = _own_cost(layer) if cost is None else cost
-        self.u_ini, self.y_ini = (as_data(n, getattr(windows, n)).double() for n in ("u_ini", "y_ini"))
-        if self.u_ini.ndim != 3 or self.y_ini.ndim != 3 or len(self.u_ini) != len(self.y_ini) or not len(self.u_ini):
-            raise ValueError(
-                "`windows` must hold u_ini and y_ini of shape (B, t_ini, n), B at least 1, got "
-                f"{tuple(self.u_ini.shape)} and {tuple(self.y_ini.shape)}."
-            )
+        self.u_ini, self.y_ini = _past(windows)
         rows = (plans - 1) * replan_every + horizon
         u_ref = torch.zeros(layer.data.n_u) if windows.u_ref is None else windows.u_ref
         self.y_ref = _reference("y_ref", windows.y_ref, len(self.u_ini), rows, layer.data.n_y)
@@ -189,6 +184,17 @@ def _own_cost(layer: DPCLayer) -> QuadraticCost:
     if len(Q) != data.n_y or len(R) != data.n_u:
         raise ValueError("Q or R of the layer spans the horizon: say with `cost=` what a run costs.")
     return QuadraticCost(Q.clone(), R.clone())
+
+
+def _past(windows: Windows) -> tuple[Tensor, Tensor]:
+    """Return u_ini and y_ini, checked, in float64."""
+    u_ini, y_ini = (as_data(name, getattr(windows, name)).double() for name in ("u_ini", "y_ini"))
+    if u_ini.ndim != 3 or y_ini.ndim != 3 or len(u_ini) != len(y_ini) or len(u_ini) == 0:
+        raise ValueError(
+            "`windows` must hold u_ini and y_ini of shape (B, t_ini, n), B at least 1, got "
+            f"{tuple(u_ini.shape)} and {tuple(y_ini.shape)}."
+        )
+    return u_ini, y_ini
 
 
 def _reference(name: str, value: Any, windows: int, rows: int, channels: int) -> Tensor:
