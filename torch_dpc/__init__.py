@@ -1,6 +1,6 @@
 """Differentiable data-driven predictive control for PyTorch, and attacks on it."""
 
-from . import attacks, systems
+from . import attacks, systems, tuning
 from .controller import DPCController
 from .errors import ExcitationWarning, InfeasibleError, SolveError, Status
 from .hankel import HankelData, excitation_order, hankel
@@ -45,4 +45,5 @@ __all__ = [
     "register_set",
     "simulate",
     "systems",
+    "tuning",
 ]
