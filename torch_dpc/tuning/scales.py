@@ -56,15 +56,7 @@ class WeightScales(nn.Module):
 
 def with_weights(kind: type[DPCLayer], layer: DPCLayer, weights: dict[str, Tensor]) -> DPCLayer:
     """Return a layer of a kind with other weights, and everything else as it is."""
-    return kind(
-        layer.data,
-        **weights,
-        u_set=layer.u_set,
-        y_set=layer.y_set,
-        backward=layer.backward_system,
-        solver=layer.solver,
-        on_failure=layer.on_failure,
-    )
+    return kind(layer.data, **{**layer.config(), **weights})
 
 
 def base_weight(name: str, value: Any, channels: int | None = None) -> Tensor:
