@@ -44,7 +44,7 @@ from _bench_docs import refresh  # noqa: E402
 from _bench_report import write_report  # noqa: E402
 from _bench_row import MARK, measure  # noqa: E402
 from _common import RESULTS, cores  # noqa: E402
-from torch_dpc.kernels import instructions  # noqa: E402
+from torch_dpc.solve.kernels import instructions  # noqa: E402
 
 TIME_LIMIT = {"full": 60.0, "quick": 20.0}  # [s] a row, imports included
 

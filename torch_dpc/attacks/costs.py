@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from ..checks import as_data
-from ..hankel import HankelData
+from ..data.hankel import HankelData
+from ..problem.weights import weight_matrix
 from ..solution import DPCSolution
-from ..weights import weight_matrix
 from .predictor import Predictor
 from .references import last_rows, to_horizon
 

@@ -15,8 +15,8 @@ from ..attacks.costs import Cost, at_step
 from ..checks import as_data, check_count
 from ..errors import Status
 from ..layer import DPCLayer
-from ..reduction import Reduction
-from ..solve import Solver
+from ..problem.reduction import Reduction
+from ..solve.solver import Solver
 from .attacker import Attacker
 from .outcome import DataPredictor, Predictor, QuadraticCost, RunCost
 from .scales import WeightScales, base_weight, with_weights

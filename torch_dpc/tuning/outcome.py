@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..hankel import HankelData
+from ..data.hankel import HankelData
 
 #: What inputs do from a window on: (u_ini, y_ini, u) -> y, all `(*batch, steps, n)`.
 Predictor = Callable[[Tensor, Tensor, Tensor], Tensor]

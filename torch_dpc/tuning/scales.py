@@ -8,7 +8,7 @@ import torch
 from torch import Tensor, nn
 
 from ..layer import DPCLayer
-from ..weights import as_weight
+from ..problem.weights import as_weight
 
 
 class WeightScales(nn.Module):

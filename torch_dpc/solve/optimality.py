@@ -20,8 +20,8 @@ from typing import Any, NamedTuple
 import numpy as np
 import torch
 
-from .reduction import Reduction
-from .rows import Tracking
+from ..problem.reduction import Reduction
+from ..problem.rows import Tracking
 
 #: A row is weakly active where its distance to the bound, and the displacement G_ii lam_i that its multiplier makes,
 #: are both at most this, relative to 1 + |bound|. Such a row counts as inactive in every derivative.
