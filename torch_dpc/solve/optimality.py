@@ -109,7 +109,9 @@ class Optimality:
         self._diagonal = array(reduction.G.diagonal(dim1=-2, dim2=-1).contiguous())
         self._Eq, self._C, self._Z = (array(m) for m in (rows.Eq, rows.C, rows.Z))
         self._Eq_theta = _as_slice(rows.Eq_theta)
-        self._weight_g = array(2 * weights.lambda_g[..., None] * rows.charged)
+        alike = rows.charged.ndim == 1  # the same entries for every sample: the last ones
+        self._charged = slice(int((rows.charged == 0).sum()), None) if alike else slice(None)
+        self._weight_g = array(2 * weights.lambda_g[..., None] * (1.0 if alike else rows.charged))
         self._fits = [
             (
                 array(fit.rows),
@@ -164,8 +166,9 @@ class Optimality:
             of_rows, of_measured = _back(weight * _times(S, a), S), _back(weight * theta[..., measured], S)
             total = total + (of_rows - of_measured)
             terms = terms + norm(of_rows) + norm(of_measured)
-        of_M = self._weight_g * a
-        stationary = norm(_back(total + of_M, self._Z)) / (terms + norm(of_M) + _TINY)
+        of_M = self._weight_g * a[..., self._charged]
+        total[..., self._charged] += of_M
+        stationary = norm(_back(total, self._Z)) / (terms + norm(of_M) + _TINY)
         return in_set + held + stationary
 
     def _tracked(self, theta: Any, v: Any, lam: Any) -> tuple[Any, Any]:
