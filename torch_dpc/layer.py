@@ -26,7 +26,7 @@ from .sets.feasible import FeasibleSet
 from .solution import DPCSolution, SolveInfo
 from .solve.convex_solve import ConvexSolver
 from .solve.solver import Planned, Solver
-from .transforms import carries_derivative
+from .transforms import carries_derivative, is_mapped
 
 
 class DPCLayer(nn.Module):
@@ -339,7 +339,7 @@ class DPCLayer(nn.Module):
         if not sets.is_box:
             raise ValueError("the sets of this layer are not all boxes: they have no bounds.")
         sources = tuple(bound for owner, _ in sets.parts for bound in (owner.lower, owner.upper))
-        if carries_derivative(sources):
+        if carries_derivative(sources) or any(map(is_mapped, sources)):
             return sets.bounds(device)
         return self._cached(("bounds", device), sources, sets.bounds, device)
 

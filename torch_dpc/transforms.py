@@ -20,6 +20,15 @@ def is_plain(tensor: Tensor) -> bool:
     return type(tensor) is Tensor and not _is_wrapped(tensor) and not _is_legacy_batched(tensor)
 
 
+def is_mapped(value: Any) -> bool:
+    """Return whether `vmap` maps a tensor, perhaps below other transforms: no decision can follow from its numbers."""
+    while isinstance(value, Tensor) and _is_wrapped(value) and _functorch is not None:
+        if _functorch.is_batchedtensor(value):
+            return True
+        value = _functorch.get_unwrapped(value)
+    return isinstance(value, Tensor) and _is_legacy_batched(value)
+
+
 def apply_function(function: type[torch.autograd.Function], *args: Any) -> Any:
     """Return `function.apply(*args)`.
 

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from .base import ConvexSet
+from ..transforms import is_mapped
 from .parameters import as_bound, as_tensor, short
 
 
@@ -58,7 +59,9 @@ class Box(ConvexSet):
                 )
 
     def check_bounds(self) -> None:
-        """Raise ValueError unless lower <= upper and a finite point lies between."""
+        """Raise ValueError unless lower <= upper and a finite point lies between; bounds that `vmap` maps go unseen."""
+        if is_mapped(self.lower) or is_mapped(self.upper):
+            return
         lower, upper = (as_tensor(bound).detach().double().cpu() for bound in (self.lower, self.upper))
         if not bool((lower <= upper).all()):
             raise ValueError("`lower` must be at most `upper` in every component, got crossed or NaN bounds.")

@@ -90,7 +90,7 @@ class FeasibleSet:
             assert isinstance(owner, Box)
             owner.check_bounds()
             for side, value in zip(sides, owner.bounds(like), strict=True):
-                side.append(torch.broadcast_to(value, (*value.shape[:-2], *places.shape)).flatten(-2))
+                side.append(_flat(torch.broadcast_to(value, (*value.shape[:-2], *places.shape))))
         inverse = self.inverse.to(device)
         return _joined(sides[0])[..., inverse], _joined(sides[1])[..., inverse]
 
@@ -101,7 +101,7 @@ class FeasibleSet:
         """
         return _joined(
             [
-                owner.prox(self._group(x, at, shape), self._scale(gamma, at, shape)).flatten(-2)
+                _flat(owner.prox(self._group(x, at, shape), self._scale(gamma, at, shape)))
                 for owner, at, shape in self._slices
             ]
         )
@@ -176,7 +176,7 @@ class FeasibleSet:
         out = []
         for (owner, at, shape), D in zip(self._slices, blocks, strict=True):
             group = self._group(x, at, shape)
-            out.append((D * group if owner.separable else (D @ group[..., None])[..., 0]).flatten(-2))
+            out.append(_flat(D * group if owner.separable else (D @ group[..., None])[..., 0]))
         return _joined(out)
 
     def outer(self, x: Tensor, y: Tensor, blocks: Blocks) -> Blocks:
@@ -192,7 +192,7 @@ class FeasibleSet:
         values, vectors = [], []
         for (owner, _, _), D in zip(self._slices, blocks, strict=True):
             value, vector = (D, torch.ones_like(D)) if owner.separable else torch.linalg.eigh(D)
-            values.append(value.flatten(-2))
+            values.append(_flat(value))
             vectors.append(vector)
         return _joined(values).clamp(0.0, 1.0), vectors
 
@@ -222,11 +222,11 @@ class FeasibleSet:
     @staticmethod
     def _scale(gamma: Tensor | float, at: slice, shape: tuple[int, ...]) -> Tensor | float:
         """Return gamma of each group, `(..., groups, 1)`."""
-        return gamma if isinstance(gamma, float) else gamma[..., at].unflatten(-1, shape)[..., :1]
+        return gamma if isinstance(gamma, float) else FeasibleSet._group(gamma, at, shape)[..., :1]
 
     @staticmethod
     def _group(x: Tensor, at: slice, shape: tuple[int, ...]) -> Tensor:
-        return x[..., at].unflatten(-1, shape)
+        return x[..., at].reshape(*x.shape[:-1], *shape)
 
 
 def _snapshot(module: nn.Module) -> nn.Module:
@@ -237,6 +237,11 @@ def _snapshot(module: nn.Module) -> nn.Module:
     copy.__dict__["_buffers"] = dict(module._buffers)
     copy.__dict__["_modules"] = {k: None if m is None else _snapshot(m) for k, m in module._modules.items()}
     return copy
+
+
+def _flat(x: Tensor) -> Tensor:
+    """Return `(..., groups size)`; not by `flatten`, for which the older `vmap` has no rule, nor for `unflatten`."""
+    return x.reshape(*x.shape[:-2], x.shape[-2] * x.shape[-1])
 
 
 def _joined(parts: list[Tensor]) -> Tensor:

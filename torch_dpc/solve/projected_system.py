@@ -21,8 +21,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..linear import lead_all, outer, times
+from ..linear import lead_all, outer, times, unit_vectors
 from ..sets.feasible import Blocks, FeasibleSet
+from ..transforms import is_grads_batched
 
 #: Directions whose eigenvalue of D is within this of 1 are free.
 FREE = 1e-12
@@ -46,7 +47,6 @@ def solve_system(
     """
     d, vectors = sets.spectral(blocks)
     b = sets.rotate(vectors, rhs)
-    d = d.expand_as(b)
     held = d < 1 - FREE
     rows = held.reshape(-1, held.shape[-1]).any(0).nonzero()[:, 0]
     turned = sets.rotate_matrix(vectors, G)
@@ -56,6 +56,7 @@ def solve_system(
     on = held[..., rows]
     lack = torch.where(on, 1 - d[..., rows], 1.0)
     curvature = torch.where(on, gamma[rows] * d[..., rows] / lack, 1.0)
+    # D has the dimensions of the samples; those that rhs has before them are many right-hand sides of one system.
     matrix = turned[..., rows[:, None], rows] * (on[..., :, None] & on[..., None, :]) + torch.diag_embed(curvature)
     right = b[..., rows] if transposed else b[..., rows] / lack - times(turned[..., rows, :], free)
     y, regular = _symmetric_solve(matrix, torch.where(on, right, 0.0))
@@ -71,19 +72,25 @@ def solve_system(
 
 
 def _symmetric_solve(matrix: Tensor, rhs: Tensor) -> tuple[Tensor, Tensor]:
-    """Solve positive semidefinite systems `(..., k, k)`; say which were nonsingular, `(...)`."""
+    """Solve positive semidefinite systems `(..., k, k)`; say which were nonsingular, `(...)`.
+
+    Dimensions that rhs `(..., k)` has before those of the matrices are many right-hand sides of each.
+    """
     batch, k = rhs.shape[:-1], rhs.shape[-1]
-    flat, right = matrix.expand(*batch, k, k).reshape(-1, k, k), rhs.reshape(-1, k)
-    scale = flat.diagonal(dim1=-2, dim2=-1).clamp_min(torch.finfo(flat.dtype).tiny).rsqrt()
-    unit = flat * scale[:, :, None] * scale[:, None, :]
+    own = batch[len(batch) - (matrix.ndim - 2) :]
+    flat = matrix.expand(*own, k, k).reshape(-1, k, k)
+    many = batch[: len(batch) - len(own)].numel()
+    right = rhs.reshape(many, len(flat), k).permute(1, 2, 0)  # (systems, k, right-hand sides)
+    scale = flat.diagonal(dim1=-2, dim2=-1).clamp_min(torch.finfo(flat.dtype).tiny).rsqrt()[..., None]
+    unit = flat * scale * scale.mT
     L, info = torch.linalg.cholesky_ex(unit)
-    y = torch.cholesky_solve((right * scale)[..., None], L)[..., 0] * scale
+    y = torch.cholesky_solve(right * scale, L) * scale
     regular = (info == 0) & (L.diagonal(dim1=-2, dim2=-1).square().amin(-1) > TRUSTED)
     bad = (~regular).nonzero()[:, 0]
     if len(bad):
         inverse = torch.linalg.pinv(unit[bad], hermitian=True, rtol=DEPENDENT)
-        y[bad] = times(inverse, right[bad] * scale[bad]) * scale[bad]
-    return y.reshape(*batch, k), regular.reshape(batch)
+        y[bad] = inverse @ (right[bad] * scale[bad]) * scale[bad]
+    return y.permute(2, 0, 1).reshape(*batch, k), regular.reshape(own).expand(batch)
 
 
 class SolveSystem(torch.autograd.Function):
@@ -107,7 +114,7 @@ class SolveSystem(torch.autograd.Function):
     def backward(ctx: Any, x_bar: Tensor) -> tuple[Tensor | None, ...]:
         x, G, *blocks = ctx.saved_tensors
         sets, gamma = ctx.sets, ctx.gamma
-        s = SolveSystem.apply(x_bar, G, sets, gamma, not ctx.transposed, *blocks)
+        s = _solve(x_bar, G, sets, gamma, not ctx.transposed, blocks)
         left, right = (x, s) if ctx.transposed else (s, x)  # K_bar = -left right'
         G_bar = outer(sets.apply(blocks, left) - left, right, G) if ctx.needs_input_grad[1] else None
         D_bar: Blocks = [None] * len(blocks)  # type: ignore[list-item]
@@ -130,7 +137,7 @@ class SolveSystem(torch.autograd.Function):
                 change = change - (gamma * moved - times(G, moved))
             else:
                 change = change - sets.apply(D_t, gamma * x - times(G, x))
-        return SolveSystem.apply(change, G, sets, gamma, transposed, *blocks)
+        return _solve(change, G, sets, gamma, transposed, blocks)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Tensor, int]:
@@ -139,6 +146,14 @@ class SolveSystem(torch.autograd.Function):
         tails = (1, 2, *(sets.tails))
         rhs, G, *blocks = lead_all((rhs, G, *blocks), dims, tails, info.batch_size)
         return SolveSystem.apply(rhs, G, sets, gamma, transposed, *blocks), 0
+
+
+def _solve(rhs: Tensor, G: Tensor, sets: FeasibleSet, gamma: Tensor, transposed: bool, blocks: Blocks) -> Tensor:
+    """Return what `SolveSystem` does, also for the many right-hand sides of the older `vmap`: by the inverse."""
+    if not is_grads_batched(rhs):
+        return SolveSystem.apply(rhs, G, sets, gamma, transposed, *blocks)
+    columns = SolveSystem.apply(unit_vectors(rhs), G, sets, gamma, transposed, *blocks)
+    return times(columns.movedim(0, -1), rhs)
 
 
 class Implicit(torch.autograd.Function):
@@ -180,7 +195,7 @@ class Implicit(torch.autograd.Function):
         v_bar = torch.zeros_like(lam) if v_bar is None else torch.where(solved, v_bar, 0.0)
         rhs = -times(G, v_bar)
         rhs = rhs if lam_bar is None else rhs + torch.where(solved, lam_bar, 0.0)
-        w = SolveSystem.apply(rhs, G, ctx.sets, ctx.gamma, True, *blocks)
+        w = _solve(rhs, G, ctx.sets, ctx.gamma, True, blocks)
         v0_bar = v_bar + w - ctx.sets.apply(blocks, w)
         G_bar = outer(-v0_bar, lam, G) if ctx.needs_input_grad[1] else None
         return v0_bar, G_bar, -w, None, None, None, None, None, None
@@ -197,7 +212,7 @@ class Implicit(torch.autograd.Function):
         rhs = free - ctx.sets.apply(blocks, free)
         if projected_t is not None:
             rhs = rhs - projected_t
-        lam_t = SolveSystem.apply(torch.where(solved, rhs, 0.0), G, ctx.sets, ctx.gamma, False, *blocks)
+        lam_t = _solve(torch.where(solved, rhs, 0.0), G, ctx.sets, ctx.gamma, False, blocks)
         return torch.where(solved, free - times(G, lam_t), 0.0), lam_t
 
     @staticmethod
