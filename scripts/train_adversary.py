@@ -36,7 +36,7 @@ from _adversary_training import Stage, process_group, rank, read_tensors, train,
 from _common import arguments, read_rows, run_all, versions, write_rows
 from torch_dpc import attacks
 
-HIDDEN = [32, 32]
+HIDDEN = [16]
 # Iterations of each stage, windows and closed loops an iteration, runs recorded for training and for judging.
 FULL = {
     "masses": {
