@@ -44,12 +44,12 @@ clean:  ## remove what the other targets leave, but keep .venv
 	rm -rf results site build *.egg-info .pytest_cache .mypy_cache .ruff_cache
 	find . -name .venv -prune -o -name __pycache__ -type d -exec rm -rf {} +
 
-distclean: clean  ## remove .venv too
-	rm -rf .venv
+distclean: clean  ## remove .venv and the compiled kernels too
+	rm -rf .venv torch_dpc/*.so
 
 # The stamp is written last, so an install that failed or was interrupted is taken up again by the next run.
 # An environment without a working pip was cut short before it was of use to anybody: it is begun anew.
-$(ENV): setup.cfg setup.py constraints.txt torch_dpc/_kernels.c $(wildcard torch_dpc/*.h)
+$(ENV): setup.cfg setup.py constraints.txt torch_dpc/solve/_kernels.c $(wildcard torch_dpc/solve/*.h)
 	@$(PY) -m pip --version >/dev/null 2>&1 || { \
 	test -n "$(PYTHON)" || { echo "Python 3.11 was not found: install it, or name one with make PYTHON=..."; exit 1; }; \
 	echo "Creating .venv with $(PYTHON) (about 2 minutes the first time) ..."; $(PYTHON) -m venv --clear .venv; }

@@ -3,9 +3,9 @@
 from setuptools import Extension, setup
 
 kernels = Extension(
-    "torch_dpc._kernels",
-    ["torch_dpc/_kernels.c"],
-    depends=["torch_dpc/_system.h", "torch_dpc/_boxes.h", "torch_dpc/_batch.h"],
+    "torch_dpc.solve._kernels",
+    ["torch_dpc/solve/_kernels.c"],
+    depends=["torch_dpc/solve/_system.h", "torch_dpc/solve/_boxes.h", "torch_dpc/solve/_batch.h"],
     extra_compile_args=["-O3", "-Wno-psabi"],  # vectors are passed between inlined functions alone
     optional=True,
 )

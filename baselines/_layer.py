@@ -10,10 +10,10 @@ from torch import Tensor
 
 from torch_dpc import Box, DPCLayer, HankelData
 from torch_dpc.checks import is_finite
-from torch_dpc.problem import Sizes, projector
-from torch_dpc.reduction import Reduction
-from torch_dpc.rows import Terms
-from torch_dpc.weights import penalty, psd_root, weight_matrix
+from torch_dpc.problem.compact_form import Sizes, projector
+from torch_dpc.problem.reduction import Reduction
+from torch_dpc.problem.rows import Terms
+from torch_dpc.problem.weights import penalty, psd_root, weight_matrix
 
 #: Keeps 0 / 0 at 0.
 _TINY = 1e-300
@@ -105,7 +105,7 @@ class Judge:
     Args:
         layer: the layer whose problem it is; read now.
         tolerance: a row touches a bound within tolerance (1 + |v|), and is active if the displacement G_ii lam_i that
-            its multiplier makes is larger than that, as in :mod:`torch_dpc.optimality`.
+            its multiplier makes is larger than that, as in :mod:`torch_dpc.solve.optimality`.
     """
 
     def __init__(self, layer: DPCLayer, tolerance: float):

@@ -3,7 +3,8 @@
     minimise over z   1/2 z'Pz + q'z     subject to   A z = b,   lower <= C z <= upper,
 
 q, b and the bounds affine in theta = (u_ini, y_ini, u_ref, y_ref). "paper" is the problem as the paper prints it,
-z = (u, y, g), A = H. "reduced" is the least-distance form of :mod:`torch_dpc.reduction`, which solvers like best:
+z = (u, y, g), A = H. "reduced" is the least-distance form of :mod:`torch_dpc.problem.reduction`, which solvers like
+best:
 
     minimise over x   1/2 |x|^2     subject to   lower - v0 <= Ct x <= upper - v0,     v0 = V theta,  v = v0 + Ct x.
 

@@ -1,7 +1,7 @@
 """The plan and its gradient in higher precision, against which the benchmark measures every solver.
 
 With the rows A that the solution holds at their bounds b_A, the problem is a linear system. In the coordinates
-g = B a of the data's row space (`torch_dpc.reduction.DataRows`),
+g = B a of the data's row space (`torch_dpc.problem.reduction.DataRows`),
 
     [Psi Up' C_A'; Up 0 0; C_A 0 0] [a; mu; nu] = [phi; u_ini; b_A],
     Psi = Uf'R Uf + Yf'Q Yf + 2 lambda_g M + 2 lambda_s Yp'Yp,     phi = Uf'R u_ref + Yf'Q y_ref + 2 lambda_s Yp'y_ini,

@@ -10,6 +10,7 @@ from torch import Tensor
 import figure3_masses
 import figure4_quadrotor
 import torch_dpc as dpc
+from _common import ATTACK_SEED
 
 OTHER_SEED, HELD_OUT_SEED = 100, 200  # the attacker's recording and the held-out one, besides the controller's own
 
@@ -105,3 +106,26 @@ def surrogate(
         u_set=dpc.Box(-s.U_MAX, s.U_MAX),
         y_set=dpc.Box(getattr(s, "Y_MIN", -s.Y_MAX), s.Y_MAX),
     )
+
+
+def closed_loop(plant: Plant, victim: dpc.DPCLayer, attack: Any, seed: int) -> tuple[float, bool]:
+    """Return the mean error of a run of the plant's figure [m], and whether the vehicle crashed.
+
+    The error is that of the first mass, which is 0 without an attack, or of the quadrotor's position.
+    """
+    s = plant.settings
+    options = {
+        "steps": s.STEPS,
+        "attack": attack,
+        "generator": torch.Generator().manual_seed(ATTACK_SEED + seed),
+    }
+    controller = dpc.DPCController(victim, s.REPLAN_EVERY, on_failure="hold")
+    if s is figure3_masses:
+        options |= {"u_ref": s.U_REF, "reset": {"state": s.Y_REF}, "u_warmup": s.U_REF}
+        log = dpc.simulate(dpc.systems.OscillatingMasses(), controller, s.Y_REF, **options)
+        return float((log.y - log.y_ref)[:, 0].abs().mean()), False
+    with dpc.systems.Quadrotor() as quadrotor:
+        options["reset"] = {"position": s.circle(1)[0, :3]}
+        flight = s.LiesWhereItCrashed(quadrotor)
+        log = dpc.simulate(flight, controller, s.circle(s.STEPS + s.HORIZON), **options)
+        return float(torch.linalg.vector_norm((log.y - log.y_ref)[:, :3], dim=1).mean()), flight.down[-1]

@@ -44,6 +44,7 @@ from _bench_docs import refresh  # noqa: E402
 from _bench_report import write_report  # noqa: E402
 from _bench_row import MARK, measure  # noqa: E402
 from _common import RESULTS, cores  # noqa: E402
+from torch_dpc.solve.kernels import instructions  # noqa: E402
 
 TIME_LIMIT = {"full": 60.0, "quick": 20.0}  # [s] a row, imports included
 
@@ -192,6 +193,7 @@ def _stamp(row: Row, mode: str, threads: int) -> Line:
 def versions() -> str:
     """Return the versions of Python and of every package that a row may use."""
     found = [f"Python {platform.python_version()}", f"torch_dpc {version('torch_dpc')}"]
+    found.append(f"kernels {instructions()}")
     for name in PACKAGES:
         try:
             found.append(f"{name} {version(name)}")

@@ -25,9 +25,9 @@ from torch import Tensor
 import torch_dpc as dpc
 from _bench_cases import CYCLE, N_G, T_INI, inputs_of, layer_of, record, take
 from _common import RESULTS, cores, versions
-from torch_dpc import kernels
-from torch_dpc.active_set import adjoint
-from torch_dpc.newton import solve_newton
+from torch_dpc.solve import kernels
+from torch_dpc.solve.active_set import adjoint
+from torch_dpc.solve.newton import solve_newton
 
 PLANT, HORIZON, BATCHES = "masses", 25, (1, 1024)
 BUDGET, LEAST, MOST = 6.0, 7, 2000  # [s] and rounds of each batch size; a round runs every stage once

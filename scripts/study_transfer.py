@@ -28,7 +28,7 @@ import torch
 import torch_dpc as dpc
 from _common import ATTACK_SEED, Array, Rows, arguments, read_rows, run_all, versions, write_rows
 from _plots import plt, style
-from _surrogates import SURROGATES, Plant, load, surrogate
+from _surrogates import SURROGATES, Plant, closed_loop, load, surrogate
 
 SEEDS, QUICK_SEEDS = 5, 1
 WINDOW_EVERY, QUICK_EVERY = 12, 48  # steps between held-out windows
@@ -83,7 +83,7 @@ def run_seed(name: str, seed: int, every: int) -> list[dict[str, Any]]:
         decrease = float((nominal - cost(plan))[solved].mean())
         queries = getattr(attack, "n_queries", 0) / len(u_ini)
         in_closed_loop = name == "masses" and (method != MORE_STEPS or knows == FULL)
-        error = closed_loop_error(plant, victim, attack, seed) if in_closed_loop else np.nan
+        error = closed_loop(plant, victim, attack, seed)[0] if in_closed_loop else np.nan
         row = {"plant": name, "seed": seed, "kind": kind, "knows": knows, "method": method, "queries": queries}
         row["cosine"] = cosine  # with what Algorithm 1 does with full knowledge, the first of all
         row |= {"psi": float(nominal.mean()), "decrease": decrease, "unsolved": int((~solved).sum()), "error": error}
@@ -91,23 +91,6 @@ def run_seed(name: str, seed: int, every: int) -> list[dict[str, Any]]:
     full = next(row for row in rows if (row["knows"], row["method"]) == (FULL, ONE_STEP))
     shares = (("share", "decrease"), ("error_share", "error"))
     return [row | {share: row[of] / full[of] for share, of in shares} for row in rows]
-
-
-def closed_loop_error(plant: Plant, victim: dpc.DPCLayer, attack: Any, seed: int) -> float:
-    """Return the mean error of the first mass in a run of Figure 3 [m]; without an attack it is 0."""
-    s = plant.settings
-    log = dpc.simulate(
-        dpc.systems.OscillatingMasses(),
-        dpc.DPCController(victim, s.REPLAN_EVERY, on_failure="hold"),
-        s.Y_REF,
-        steps=s.STEPS,
-        u_ref=s.U_REF,
-        attack=attack,
-        generator=torch.Generator().manual_seed(ATTACK_SEED + seed),
-        reset={"state": s.Y_REF},
-        u_warmup=s.U_REF,
-    )
-    return float((log.y[:, 0] - s.Y_REF[0]).abs().mean())
 
 
 def pick(rows: Rows, plant: str, knows: str, method: str, column: str) -> Array:

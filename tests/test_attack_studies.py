@@ -78,6 +78,7 @@ def test_attacks_on_the_masses_are_never_worse_than_algorithm_1(tmp_path, monkey
     monkeypatch.setattr(study_attacks, "PLANTS", {"masses": "Oscillating masses"})
     few = {name: study_attacks.BUDGETS[name] for name in ("Euclidean ball, rho", "2 sensors, rho")}
     monkeypatch.setattr(study_attacks, "BUDGETS", few)
+    monkeypatch.setattr(study_attacks, "IN_LOOP", (study_attacks.FIRST, "5 restarts"))
     study_attacks.main(["--quick", "--workers", "1", "--out", str(tmp_path)])
     rows = common.read_rows(tmp_path / "attacks.csv")
     assert len(rows["attack"]) == 2 * len(few) * len(study_attacks.ATTACKS)
@@ -87,3 +88,9 @@ def test_attacks_on_the_masses_are_never_worse_than_algorithm_1(tmp_path, monkey
     np.testing.assert_array_equal(decrease[:, 0], rows["decrease"][first])
     assert (decrease[:, 1:] > decrease[:, :1] * (1 - 1e-9)).all() and (decrease[:, 1] > 1.001 * decrease[:, 0]).any()
     assert "| target input | Euclidean ball, rho |" in (tmp_path / "attacks.md").read_text()
+
+    runs = common.read_rows(tmp_path / "attacks_closed_loop.csv")
+    error = dict(zip(zip(runs["cost"], runs["attack"], strict=True), runs["error"], strict=True))
+    assert error["-", "no attack"] < 1e-9 and error["tracking error", study_attacks.FIRST] < 1e-9
+    assert error["-", "random noise"] < error["target input", study_attacks.FIRST]
+    assert error["tracking error", "5 restarts"] > 2 * error["target input", study_attacks.FIRST]

@@ -348,3 +348,18 @@ def test_a_set_learns_and_its_change_is_seen():
 def test_bad_layers_are_named(options, says):
     with pytest.raises(ValueError, match=says):
         dpc.DPCLayer(small_data(), **{**SMALL, **options})
+
+
+@pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")
+@pytest.mark.parametrize("case", ["ball", "cone of outputs", "product", "soft outputs", "changes of the input"])
+def test_on_a_gpu(case):
+    layer, (u_ini, y_ini) = layer_of(case), inputs()
+    found = {}
+    for device in ("cpu", "cuda"):
+        y = y_ini.to(device).requires_grad_()
+        sol = layer(u_ini.to(device), y, y_ref=Y_REF.to(device))
+        sol.u.square().sum().backward()
+        assert sol.u.device.type == device
+        found[device] = (sol.u.cpu(), sol.lam.cpu(), y.grad.cpu())
+    for on_gpu, on_cpu in zip(found["cuda"], found["cpu"], strict=True):
+        assert relative(on_gpu, on_cpu) < 1e-9

@@ -8,7 +8,7 @@ import torch
 
 import torch_dpc as dpc
 from helpers import generator, masses_data, randn, relative, small_data
-from torch_dpc.problem import projector
+from torch_dpc.problem.compact_form import projector
 
 EXACT = 1e-10
 GOOD = {"t_ini": 2, "horizon": 3}

@@ -11,7 +11,7 @@ import torch
 
 import torch_dpc as dpc
 from helpers import HOLDING, Y_REF, nearest_point, paper_layer, randn, relative, small_layer, windows
-from torch_dpc import active_set, kernels, newton
+from torch_dpc.solve import active_set, kernels, newton
 
 built = pytest.mark.skipif(kernels._kernels is None, reason="the extension is not built here (no compiler)")
 SAME = 1e-10
@@ -292,6 +292,6 @@ def test_gradcheck_without_the_kernels(batch, solver, monkeypatch):
 
 
 def test_the_environment_switches_them_off():
-    program = "from torch_dpc import kernels; import torch; assert not kernels.serve(torch.ones(1))"
+    program = "from torch_dpc.solve import kernels; import torch; assert not kernels.serve(torch.ones(1))"
     environment = {**os.environ, "TORCH_DPC_NO_KERNELS": "1", "PYTHONPATH": os.pathsep.join(sys.path)}
     subprocess.run([sys.executable, "-c", program], check=True, env=environment)

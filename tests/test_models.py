@@ -7,7 +7,7 @@ from torch.nn.utils import parametrize
 
 import torch_dpc as dpc
 from helpers import SMALL, Y_REF, randn, relative, small_data, small_layer, windows
-from torch_dpc.projected_kkt import jacobian
+from torch_dpc.problem.projected_kkt import jacobian
 
 EXACT = 1e-10
 

@@ -21,7 +21,7 @@ from helpers import (
     windows,
 )
 from torch_dpc import CompactForm
-from torch_dpc.projected_kkt import optimality_map
+from torch_dpc.problem.projected_kkt import optimality_map
 
 #: F relative to its terms, 1e-8 at most. A w found here by least squares is no better than its condition (lambda_s).
 F_TOLERANCE = {"lam": 1e-10, "least squares": 1e-9}

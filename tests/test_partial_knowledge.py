@@ -183,6 +183,8 @@ def test_another_horizon_cuts_the_references_or_holds_their_last_row(horizon):
     assert p.any() and torch.equal(p, fitted(u_ini, y_ini, **fitting))
     tracking = attacks.LinearizedAttack(surrogate, attacks.TrackingError(surrogate.data), budget)
     assert torch.equal(tracking(u_ini, y_ini, y_ref=y_ref, u_ref=u_ref), tracking(u_ini, y_ini, **fitting))
+    with pytest.raises(ValueError, match=f"the plans have {horizon} steps and the `data` of TrackingError predict 25"):
+        attacks.LinearizedAttack(surrogate, attacks.TrackingError(masses_data()), budget)(u_ini, y_ini, y_ref=y_ref)
 
 
 def test_a_surrogate_with_a_shorter_past_leaves_the_older_rows_alone():

@@ -19,8 +19,8 @@ from helpers import (
     small_layer,
     windows,
 )
-from torch_dpc.reduction import reduce
-from torch_dpc.rows import DataRows
+from torch_dpc.problem.reduction import reduce
+from torch_dpc.problem.rows import DataRows
 
 EXACT = 1e-10
 #: The optimum itself moves by this under rounding of the data: noise 1e-8 under lambda_s = 1e6 conditions E at 1e5.

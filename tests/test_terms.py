@@ -5,7 +5,7 @@ import torch
 
 import torch_dpc as dpc
 from helpers import SMALL, Y_REF, central, masses_data, paper_layer, randn, relative, small_data, windows
-from torch_dpc.projected_kkt import optimality_map
+from torch_dpc.problem.projected_kkt import optimality_map
 
 #: A dense system of 200 unknowns, condition 1e6.
 CLOSED_FORM = 1e-9

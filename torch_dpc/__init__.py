@@ -1,17 +1,17 @@
 """Differentiable data-driven predictive control for PyTorch, and attacks on it."""
 
-from . import attacks, systems
+from . import attacks, systems, tuning
 from .controller import DPCController
+from .data.hankel import HankelData, excitation_order, hankel
+from .data.hankel_batch import HankelBatch
+from .data.stream import HankelStream
 from .errors import ExcitationWarning, InfeasibleError, SolveError, Status
-from .hankel import HankelData, excitation_order, hankel
-from .hankel_batch import HankelBatch
 from .layer import DPCLayer
-from .problem import CompactForm
+from .problem.compact_form import CompactForm
 from .saving import register_set
 from .sets import Ball, Box, ConvexSet, NonNegative, Product, Reals, SecondOrderCone, SoftBox
 from .simulation import ClosedLoopLog, Plant, collect, simulate
 from .solution import DPCSolution, SolveInfo
-from .stream import HankelStream
 
 __version__ = "0.1.0"
 
@@ -45,4 +45,5 @@ __all__ = [
     "register_set",
     "simulate",
     "systems",
+    "tuning",
 ]

@@ -22,13 +22,13 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from . import kernels
-from .active_set import adjoint, adjoint_dense, solve_active
 from .errors import Status
 from .linear import flatten_batch, lead_all, outer, times
-from .projected_kkt import FullAdjoint
-from .reduction import Reduction
-from .solve import Planned, Solver
+from .problem.projected_kkt import FullAdjoint
+from .problem.reduction import Reduction
+from .solve import kernels
+from .solve.active_set import adjoint, adjoint_dense, solve_active
+from .solve.solver import Planned, Solver
 from .transforms import apply_function, carries_derivative, is_grads_batched, is_plain
 
 
@@ -177,7 +177,7 @@ def _of_one(
     lam_array = None if lam_bar is None else kernels.as_array(lam_bar)
     A, C, G = solver.arrays
     v0_bar = kernels.adjoint_of_one(G, active.numpy(), v_bar, lam_array)
-    return None if v0_bar is None else torch.from_numpy((v0_bar @ C) @ A)
+    return None if v0_bar is None else torch.from_numpy(v0_bar.dot(C).dot(A))
 
 
 class SolveAdjoint(torch.autograd.Function):

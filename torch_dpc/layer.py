@@ -10,23 +10,23 @@ import torch
 from torch import Tensor, nn
 
 from .checks import reference, window, with_one_batch
-from .convex_solve import ConvexSolver
+from .data.hankel import HankelData
+from .data.hankel_batch import HankelBatch
 from .errors import Status
 from .function import solve_reduced
-from .hankel import HankelData
-from .hankel_batch import HankelBatch
 from .linear import times
-from .problem import CompactForm, Sizes, compact_form
-from .projected_kkt import FullSystem
-from .reduction import Reduction, reduce
-from .rows import DataRows, Terms
+from .problem.compact_form import CompactForm, Sizes, compact_form
+from .problem.projected_kkt import FullSystem
+from .problem.reduction import Reduction, reduce
+from .problem.rows import DataRows, Terms
+from .problem.weights import Weights, penalty, weight_matrix
 from .saving import load_layer, save_layer
 from .sets import ConvexSet, Reals
 from .sets.feasible import FeasibleSet
 from .solution import DPCSolution, SolveInfo
-from .solve import Planned, Solver
+from .solve.convex_solve import ConvexSolver
+from .solve.solver import Planned, Solver
 from .transforms import carries_derivative
-from .weights import Weights, penalty, weight_matrix
 
 
 class DPCLayer(nn.Module):
@@ -133,7 +133,7 @@ class DPCLayer(nn.Module):
 
     @property
     def reduction(self) -> Reduction:
-        """The reduced problem of the present weights; see :mod:`torch_dpc.reduction`."""
+        """The reduced problem of the present weights; see :mod:`torch_dpc.problem.reduction`."""
         return self._factors(self.data.device)[0]
 
     @property

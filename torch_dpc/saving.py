@@ -19,9 +19,9 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 
-from .hankel import HankelData
+from .data.hankel import HankelData
+from .data.rowspace import RowSpace
 from .registry import arguments_of, known_sets, register_set
-from .rowspace import RowSpace
 from .sets import ConvexSet
 
 __all__ = ["load_layer", "register_set", "save_layer"]

@@ -14,9 +14,9 @@ import torch
 from torch import Tensor
 
 from ..checks import as_data
-from ..hankel import HankelData
+from ..data.hankel import HankelData
+from ..problem.weights import weight_matrix
 from ..solution import DPCSolution
-from ..weights import weight_matrix
 from .predictor import Predictor
 from .references import last_rows, to_horizon
 
@@ -97,6 +97,11 @@ class TrackingError:
         reference = torch.zeros(()) if y_ref is None else to_horizon(as_data("y_ref", y_ref), horizon)
 
         def psi(solution: DPCSolution) -> Tensor:
+            if solution.u.shape[-2] != horizon:
+                raise ValueError(
+                    f"the plans have {solution.u.shape[-2]} steps and the `data` of TrackingError predict {horizon}: "
+                    "give it the data of the attacker's own layer."
+                )
             y_true = self.predictor(u_ini, y_ini, solution.u)
             wanted = reference.to(y_true).expand_as(y_true)
             scale = torch.maximum(y_true.detach().abs(), wanted.abs()).amax((-2, -1), keepdim=True)

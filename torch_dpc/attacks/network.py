@@ -12,7 +12,7 @@ import torch
 from torch import Tensor, nn
 
 from ..checks import as_data, check_count, reference, window
-from ..hankel import HankelData
+from ..data.hankel import HankelData
 
 
 class AttackPolicy(nn.Module):

@@ -1,9 +1,9 @@
 """The compiled kernels of `_kernels.c`: the small systems of a sample without the dispatch of an array library.
 
 They serve float64 on the CPU wherever the extension was built; `serve` is what everybody asks. Elsewhere, or with
-`TORCH_DPC_NO_KERNELS=1` in the environment, the operations of torch in :mod:`torch_dpc.newton` and
-:mod:`torch_dpc.active_set` do the same work. A kernel flags the samples it cannot vouch for and leaves them to its
-caller. Each sample is computed by one thread: its result depends neither on the batch around it nor on how many
+`TORCH_DPC_NO_KERNELS=1` in the environment, the operations of torch in :mod:`torch_dpc.solve.newton` and
+:mod:`torch_dpc.solve.active_set` do the same work. A kernel flags the samples it cannot vouch for and leaves them to
+its caller. Each sample is computed by one thread: its result depends neither on the batch around it nor on how many
 threads (at most torch's own) share the batch.
 """
 
@@ -38,6 +38,11 @@ TOUCHING = 1e-10
 def serve(tensor: Tensor) -> bool:
     """Return whether the kernels take the solves of which this tensor is a part."""
     return _kernels is not None and tensor.device.type == "cpu"
+
+
+def instructions() -> str:
+    """Return which vector instructions the kernels use here, "none" where there are no kernels."""
+    return "none" if _kernels is None else _kernels.instructions
 
 
 def solve_boxes(

@@ -14,8 +14,8 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from .hankel import HankelData
-from .hankel_batch import HankelBatch
+from ..data.hankel import HankelData
+from ..data.hankel_batch import HankelBatch
 from .rows import Terms
 from .weights import Weights
 

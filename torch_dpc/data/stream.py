@@ -16,7 +16,7 @@ import torch
 from numpy.typing import NDArray
 from scipy.linalg import lapack
 
-from .checks import as_data, check_count
+from ..checks import as_data, check_count
 from .excitation import has_full_row_rank
 from .hankel import HankelData
 from .rowspace import relative_tolerance

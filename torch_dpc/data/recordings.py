@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .checks import as_data
+from ..checks import as_data
 
 
 def hankel(w: Tensor, depth: int) -> Tensor:

@@ -66,7 +66,7 @@ INLINE int push(const Scratch *s, int64_t *side, const int64_t *before) {
     mask differ = {0};
     for (int64_t i = 0; i < s->n; i += WIDTH) {
         const vec pushed = load(s->v + i) + load(s->lam + i);
-        const mask now = (pushed < load(s->below + i)) - (pushed > load(s->above + i));
+        const mask now = (mask)(pushed < load(s->below + i)) - (mask)(pushed > load(s->above + i));
         mask old;
         memcpy(&old, before + i, sizeof old);
         differ |= now ^ old;

@@ -21,8 +21,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .linear import lead_all, outer, times
-from .sets.feasible import Blocks, FeasibleSet
+from ..linear import lead_all, outer, times
+from ..sets.feasible import Blocks, FeasibleSet
 
 #: Directions whose eigenvalue of D is within this of 1 are free.
 FREE = 1e-12

@@ -7,7 +7,7 @@ import warnings
 import torch
 from torch import Tensor
 
-from .errors import ExcitationWarning
+from ..errors import ExcitationWarning
 from .recordings import hankel
 from .rowspace import relative_tolerance
 

@@ -16,7 +16,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .checks import check_count
+from ..checks import check_count
 from .excitation import excitation_order, has_full_row_rank, warn_of_excitation
 from .recordings import as_recordings, hankel
 from .rowspace import RowSpace, relative_tolerance
@@ -190,7 +190,7 @@ class HankelData:
 
     @cached_property
     def row_space(self) -> RowSpace:
-        """The factorisation of the stacked data, made once; see :class:`torch_dpc.rowspace.RowSpace`."""
+        """The factorisation of the stacked data, made once; see :class:`torch_dpc.data.rowspace.RowSpace`."""
         with torch.inference_mode(False), torch.no_grad():
             return RowSpace.of(self)
 

@@ -6,9 +6,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..linear import times
+from ..sets.feasible import FeasibleSet
 from .dual_active_set import SOLVED_FLAG, Daqp
-from .linear import times
-from .sets.feasible import FeasibleSet
 
 #: Directions of Ct below this fraction of the largest are none.
 DEPENDENT = 1e-10

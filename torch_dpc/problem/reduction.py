@@ -1,6 +1,6 @@
 """The exact reduction of the DPC problem to its constrained rows.
 
-In the coordinates a of the row space of the data (:mod:`torch_dpc.rows`) two steps remain:
+In the coordinates a of the row space of the data (:mod:`torch_dpc.problem.rows`) two steps remain:
 
 1. The equalities Eq a = e, Up g = u_ini above all, are eliminated:  a = Eq^+ e + Z x,  Z a basis of the kernel of Eq.
 2. The cost is one weighted least squares  min 1/2 |E x - f|^2,  with the rows
@@ -106,7 +106,7 @@ def reduce(rows: DataRows, weights: Weights) -> Reduction:
     """Reduce the problem of the data and weights.
 
     Values come from the QR of E. Where the data or the weights carry a graph, V, G, A_theta and A_lam carry it on, by
-    the derivative of the saddle-point system they solve (:mod:`torch_dpc.saddle`).
+    the derivative of the saddle-point system they solve (:mod:`torch_dpc.problem.saddle`).
     """
     with torch.no_grad():
         E, f = _least_squares(rows, weights)

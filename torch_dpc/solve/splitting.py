@@ -2,8 +2,8 @@
 
 A solution is a zero of  F(lam) = v - P(v + gamma lam),  v = v0 - G lam.  A few steps of Douglas-Rachford splitting
 (Lions and Mercier 1979) come near, and semismooth Newton on F finishes: its step is the projected system of
-:mod:`torch_dpc.projected_system`. That is all for most problems. Where the rows that meet their bounds depend on each
-other Newton's system is singular, and the augmented Lagrangian of the least-distance form,
+:mod:`torch_dpc.solve.projected_system`. That is all for most problems. Where the rows that meet their bounds depend on
+each other Newton's system is singular, and the augmented Lagrangian of the least-distance form,
 
     minimise 1/2 |x|^2   subject to   v = v0 + Ct x in the set,          x = -Ct' lam,
 
@@ -20,9 +20,9 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from .linear import times
+from ..linear import times
+from ..sets.feasible import FeasibleSet
 from .projected_system import solve_system
-from .sets.feasible import FeasibleSet
 
 #: Splitting steps before Newton.
 SPLITTING_STEPS = 20

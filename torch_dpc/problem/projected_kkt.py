@@ -19,9 +19,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .hankel import HankelData
-from .linear import flatten_batch, lead_all
-from .problem import CompactForm, Sizes, compact_form
+from ..data.hankel import HankelData
+from ..linear import flatten_batch, lead_all
+from .compact_form import CompactForm, Sizes, compact_form
 from .weights import Weights
 
 #: Rounds of scaling rows and columns. One round of rows alone leaves errors 30 times as large; more gain nothing.

@@ -11,9 +11,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from ..linear import times
 from . import kernels
 from .kernels import STANDING_OUT
-from .linear import times
 
 #: Rows of Ct that stand out of the span of the others by less than this fraction of their length are dependent.
 DEPENDENT_ROW = 1e-9

@@ -9,15 +9,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .errors import Status
+from ..errors import Status
+from ..linear import lead_all, times
+from ..problem.compact_form import Sizes
+from ..problem.reduction import Reduction
+from ..sets.feasible import FeasibleSet
 from .infeasibility import separates_from_set
-from .linear import lead_all, times
 from .optimality import BATCHED, WEAKLY_ACTIVE, Optimality
-from .problem import Sizes
 from .projected_system import Implicit, solve_system
-from .reduction import Reduction
-from .sets.feasible import FeasibleSet
-from .solve import ACCEPTED, Planned, check_finite, report_failures
+from .solver import ACCEPTED, Planned, check_finite, report_failures
 from .splitting import resolvent_of, scale_of, solve_convex
 
 #: Eigenvalues of D1 below this hold their direction.

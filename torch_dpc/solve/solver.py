@@ -11,18 +11,18 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..checks import as_data, is_finite
+from ..errors import InfeasibleError, SolveError, Status
+from ..linear import flatten_batch, times
+from ..problem.compact_form import Sizes
+from ..problem.projected_kkt import FullSystem
+from ..problem.reduction import Reduction
 from . import kernels
 from .active_set import solve_active
-from .checks import as_data, is_finite
 from .dual_active_set import SOLVED_FLAG, Daqp, sense_of, solve_daqp
-from .errors import InfeasibleError, SolveError, Status
 from .infeasibility import infeasibility_certificate
-from .linear import flatten_batch, times
 from .newton import ActiveSetResult, solve_newton
 from .optimality import BATCHED, SINGLE, Optimality
-from .problem import Sizes
-from .projected_kkt import FullSystem
-from .reduction import Reduction
 
 #: A sample is accepted when F, relative to its own terms, is at most this.
 ACCEPTED = 1e-8

@@ -1,0 +1,1 @@
+"""Recorded data: Hankel matrices, from recordings or streams, and their row space."""

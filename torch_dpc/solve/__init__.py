@@ -1,0 +1,1 @@
+"""The forward solve and the systems of the derivative."""

@@ -1,0 +1,34 @@
+"""Weights that hold under attack: lambda_g, lambda_s, Q and R chosen by the worst they allow, by backprop.
+
+    minimise over the weights   E[ c(0) ] + attacked_weight E[ c(p) ],      p = the attacker's answer to these weights
+
+c(p) is what the plan made at y_ini + p would *truly* cost: its inputs are run through a predictor that starts from the
+unattacked window, over one plan or over several in closed loop. The attacker knows the weights. Two derivatives:
+
+* "danskin" holds p fixed. Where p maximises c itself over one plan, that is the derivative of the worst case (Danskin
+  1966); for any other attacker it is a partial derivative, and cheap.
+* "attack" goes through the attacker's own step, p = argmin over the budget of <d psi / dp, p>, and so through second
+  derivatives of the layer: the whole derivative, whatever psi the attacker has.
+
+A common factor on all four weights changes no plan. It is taken out: the mean of the logarithms of R stays.
+"""
+
+from .attacker import Attacker
+from .objective import RobustObjective, Windows
+from .outcome import DataPredictor, MeanError, Predictor, QuadraticCost, RunCost
+from .scales import WeightScales
+from .search import TuningResult, tune
+
+__all__ = [
+    "Attacker",
+    "DataPredictor",
+    "MeanError",
+    "Predictor",
+    "QuadraticCost",
+    "RobustObjective",
+    "RunCost",
+    "TuningResult",
+    "WeightScales",
+    "Windows",
+    "tune",
+]

@@ -1,0 +1,210 @@
+"""The objective: what scaled weights cost without and under attack."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..attacks.budgets import Budget
+from ..attacks.costs import Cost, at_step
+from ..checks import as_data, check_count
+from ..errors import Status
+from ..layer import DPCLayer
+from ..problem.reduction import Reduction
+from ..solve.solver import Solver
+from .attacker import Attacker
+from .outcome import DataPredictor, Predictor, QuadraticCost, RunCost
+from .scales import WeightScales, base_weight, with_weights
+
+#: layer -> attack, with the call of every attack.
+AttackMaker = Callable[[DPCLayer], Callable[..., Tensor]]
+
+
+@dataclass(frozen=True, eq=False)
+class Windows:
+    """Where the runs that are judged begin.
+
+    Attributes:
+        u_ini, y_ini: past windows, unattacked, `(B, t_ini, n)`.
+        y_ref, u_ref: references from the first step of the plan on: `(n,)`, or `(steps, n)`, or `(B, steps, n)`; the
+            last row is held beyond its end. u_ref is zero by default.
+    """
+
+    u_ini: Tensor
+    y_ini: Tensor
+    y_ref: Tensor
+    u_ref: Tensor | None = None
+
+
+class RobustObjective:
+    """What a layer with scaled weights costs without and under attack; differentiable in the scales.
+
+    Args:
+        layer: the planning problem; its weights are where the scales start.
+        windows: where the runs begin.
+        budget: what the attacker may add to a window.
+        psi: what the attacker minimises, a callable DPCSolution -> `(*batch,)`, as the attacks take it; with `at(step)`
+            it moves with the run, step 0 being the first of the run here. By default minus the cost of the plan in
+            force: the attacker wants the worst.
+        predictor: what inputs truly do; by default the layer's own data.
+        cost: of a run; by default the quadratic one with the layer's present Q and R.
+        plans: how many plans a run has, each from the window that the one before left.
+        replan_every: steps of each plan that are applied; by default all.
+        attacked_weight: of the cost under attack, beside a nominal one of weight 1.
+        through: "danskin" or "attack".
+        iterations: linearised steps of the attacker, each from the last answer; 1 is Algorithm 1. More raise a convex
+            cost further, as the default psi is one between kinks.
+        attack: instead of that attacker, a callable layer -> attack; for "danskin" only.
+
+    Example:
+        >>> from torch_dpc import DPCLayer, HankelData, attacks, collect, systems
+        >>> u, y = collect(systems.OscillatingMasses(), 120, generator=torch.Generator().manual_seed(0))
+        >>> data = HankelData.from_trajectories(u, y, t_ini=4, horizon=10)
+        >>> layer = DPCLayer(data, Q=10.0, R=1.0, lambda_g=1.0, lambda_s=1e4)
+        >>> windows = Windows(u[None, :4], y[None, :4], y_ref=torch.zeros(4))
+        >>> objective = RobustObjective(layer, windows, attacks.RelativeBall(0.1), plans=3, replan_every=5)
+        >>> from torch_dpc.tuning import tune
+        >>> result = tune(objective, steps=3)
+        >>> result.history[0]["total"] > result.best["total"]
+        True
+    """
+
+    def __init__(
+        self,
+        layer: DPCLayer,
+        windows: Windows,
+        budget: Budget,
+        *,
+        psi: Any = None,
+        predictor: Predictor | None = None,
+        cost: RunCost | None = None,
+        plans: int = 1,
+        replan_every: int | None = None,
+        attacked_weight: float = 1.0,
+        through: str = "attack",
+        iterations: int = 1,
+        attack: AttackMaker | None = None,
+    ):
+        horizon = layer.data.horizon
+        replan_every = horizon if replan_every is None else replan_every
+        check_count("plans", plans)
+        check_count("replan_every", replan_every)
+        check_count("iterations", iterations)
+        if replan_every > horizon:
+            raise ValueError(f"`replan_every` must be at most the horizon, {horizon}, got {replan_every}.")
+        if through not in ("danskin", "attack"):
+            raise ValueError(f'`through` must be "danskin" or "attack", got {through!r}.')
+        if attack is not None and through != "danskin":
+            raise ValueError('an `attack` of your own has no derivative here: take `through="danskin"`.')
+        if not (math.isfinite(attacked_weight) and attacked_weight >= 0):
+            raise ValueError(f"`attacked_weight` must be finite and not negative, got {attacked_weight!r}.")
+        self.layer, self.budget, self.psi, self.attack = layer, budget, psi, attack
+        self.plans, self.replan_every, self.iterations = plans, replan_every, iterations
+        self.attacked_weight, self.through = attacked_weight, through
+        self.predictor = DataPredictor(layer.data) if predictor is None else predictor
+        self.cost = _own_cost(layer) if cost is None else cost
+        self.u_ini, self.y_ini = _past(windows)
+        rows = (plans - 1) * replan_every + horizon
+        u_ref = torch.zeros(layer.data.n_u) if windows.u_ref is None else windows.u_ref
+        self.y_ref = _reference("y_ref", windows.y_ref, len(self.u_ini), rows, layer.data.n_y)
+        self.u_ref = _reference("u_ref", u_ref, len(self.u_ini), rows, layer.data.n_u)
+
+    def __call__(self, scales: WeightScales) -> dict[str, Tensor]:
+        """Return the mean over the windows: `nominal`, `attacked`, and `total`, their weighted sum."""
+        nominal, attacked = self.costs(scales)
+        return {
+            "nominal": nominal.mean(),
+            "attacked": attacked.mean(),
+            "total": nominal.mean() + self.attacked_weight * attacked.mean(),
+        }
+
+    def costs(self, scales: WeightScales) -> tuple[Tensor, Tensor]:
+        """Return the cost of every run, without and under attack, `(B,)` each."""
+        weights = scales(self.layer)
+        planner = with_weights(_FactoredOnce, self.layer, weights)
+        perturb = self._attacker(planner, weights)
+        B, data = len(self.u_ini), self.layer.data
+        u_ini, y_ini = self.u_ini.repeat(2, 1, 1), self.y_ini.repeat(2, 1, 1)  # the nominal runs, then the attacked
+        us, ys = [], []
+        for k in range(self.plans):
+            now = slice(k * self.replan_every, k * self.replan_every + data.horizon)
+            y_ref, u_ref = self.y_ref[:, now], self.u_ref[:, now]
+            p = perturb(u_ini[B:], y_ini[B:], y_ref=y_ref, u_ref=u_ref, step=now.start)
+            p = torch.cat([torch.zeros_like(p), p.detach() if self.through == "danskin" else p])
+            plan = planner(u_ini, y_ini + p, y_ref=y_ref.repeat(2, 1, 1), u_ref=u_ref.repeat(2, 1, 1), on_failure="nan")
+            solved = (plan.info.status == Status.SOLVED)[:, None, None]
+            u = torch.where(solved, plan.u, u_ini[:, -1:])  # no plan: the last input goes on
+            y = self.predictor(u_ini, y_ini, u)
+            us.append(u[:, : self.replan_every])
+            ys.append(y[:, : self.replan_every])
+            u_ini = torch.cat([u_ini, us[-1]], dim=1)[:, -data.t_ini :]
+            y_ini = torch.cat([y_ini, ys[-1]], dim=1)[:, -data.t_ini :]
+        steps = self.plans * self.replan_every
+        references = (self.u_ref[:, :steps].repeat(2, 1, 1), self.y_ref[:, :steps].repeat(2, 1, 1))
+        costs = self.cost(torch.cat(us, dim=1), torch.cat(ys, dim=1), *references)
+        return costs[:B], costs[B:]
+
+    def _attacker(self, planner: DPCLayer, weights: dict[str, Tensor]) -> Callable[..., Tensor]:
+        if self.through == "attack" and torch.is_grad_enabled():
+            return Attacker(planner, self.budget, self._psi, self.iterations, keeps_graph=True)
+        constant = planner
+        if any(w.requires_grad for w in weights.values()):
+            constant = with_weights(_FactoredOnce, self.layer, {name: w.detach() for name, w in weights.items()})
+        if self.attack is not None:
+            return self.attack(constant)
+        return Attacker(constant, self.budget, self._psi, self.iterations)
+
+    def _psi(self, u_ini: Tensor, y_ini: Tensor, y_ref: Tensor, u_ref: Tensor, step: int) -> Cost:
+        """Return what the attacker minimises at one plan."""
+        if self.psi is not None:
+            return at_step(self.psi, step)
+        return lambda plan: -self.cost(plan.u, self.predictor(u_ini, y_ini, plan.u), u_ref, y_ref)
+
+
+class _FactoredOnce(DPCLayer):
+    """A layer for one evaluation: its weights never change, so the factors, graph included, are made once."""
+
+    _kept: tuple[Reduction, Solver] | None = None
+
+    def _factors(self, device: torch.device) -> tuple[Reduction, Solver]:
+        if self._kept is None:
+            self._kept = super()._factors(device)
+        return self._kept
+
+
+def _own_cost(layer: DPCLayer) -> QuadraticCost:
+    """Return the layer's cost with its present weights of one step."""
+    data = layer.data
+    Q, R = base_weight("Q", layer.Q, data.n_y), base_weight("R", layer.R, data.n_u)
+    if len(Q) != data.n_y or len(R) != data.n_u:
+        raise ValueError("Q or R of the layer spans the horizon: say with `cost=` what a run costs.")
+    return QuadraticCost(Q.clone(), R.clone())
+
+
+def _past(windows: Windows) -> tuple[Tensor, Tensor]:
+    """Return u_ini and y_ini, checked, in float64."""
+    u_ini, y_ini = (as_data(name, getattr(windows, name)).double() for name in ("u_ini", "y_ini"))
+    if u_ini.ndim != 3 or y_ini.ndim != 3 or len(u_ini) != len(y_ini) or len(u_ini) == 0:
+        raise ValueError(
+            "`windows` must hold u_ini and y_ini of shape (B, t_ini, n), B at least 1, got "
+            f"{tuple(u_ini.shape)} and {tuple(y_ini.shape)}."
+        )
+    return u_ini, y_ini
+
+
+def _reference(name: str, value: Any, windows: int, rows: int, channels: int) -> Tensor:
+    """Return a reference `(windows, rows, channels)`, its last row held beyond its end."""
+    tensor = as_data(name, value).double()
+    tensor = tensor[None] if tensor.ndim == 1 else tensor
+    if tensor.ndim not in (2, 3) or tensor.shape[-1] != channels or tensor.ndim == 3 and len(tensor) != windows:
+        raise ValueError(
+            f"`{name}` must have shape ({channels},), (steps, {channels}) or ({windows}, steps, {channels}), "
+            f"got {tuple(tensor.shape)}."
+        )
+    tensor = tensor[..., :rows, :].expand(windows, -1, -1)
+    return torch.cat([tensor, tensor[:, -1:].expand(-1, rows - tensor.shape[1], -1)], dim=1)
