@@ -26,7 +26,7 @@ from .sets.feasible import FeasibleSet
 from .solution import DPCSolution, SolveInfo
 from .solve.convex_solve import ConvexSolver
 from .solve.solver import Planned, Solver
-from .transforms import carries_derivative, is_mapped
+from .transforms import is_fleeting, untransformed
 
 
 class DPCLayer(nn.Module):
@@ -323,7 +323,7 @@ class DPCLayer(nn.Module):
     def _factors(self, device: torch.device) -> tuple[Reduction, Any]:
         """Return the reduced problem and its solver; with a graph, which must not outlive the call, made each time."""
         weights = (self.Q, self.R, self.lambda_g, self.lambda_s, self.lambda_u, self.R_du)
-        if carries_derivative((*weights, *self.data.matrices)):
+        if is_fleeting((*weights, *self.data.matrices)):
             return self._factor(device)
         settings = (self.solver, self.on_failure, self.backward_system)
         # The matrices of the data are constants of a frozen object: the object stands for them.
@@ -339,7 +339,7 @@ class DPCLayer(nn.Module):
         if not sets.is_box:
             raise ValueError("the sets of this layer are not all boxes: they have no bounds.")
         sources = tuple(bound for owner, _ in sets.parts for bound in (owner.lower, owner.upper))
-        if carries_derivative(sources) or any(map(is_mapped, sources)):
+        if is_fleeting(sources):
             return sets.bounds(device)
         return self._cached(("bounds", device), sources, sets.bounds, device)
 
@@ -347,14 +347,14 @@ class DPCLayer(nn.Module):
         """Return what `make` makes of the sources, made anew when their values have changed."""
         entry = self._cache.get(key)
         if entry is None or not all(map(_is_same, entry[0], sources)):
-            with torch.inference_mode(False), torch.no_grad():  # later calls may differentiate
+            with torch.inference_mode(False), torch.no_grad(), untransformed():  # later calls may differentiate
                 kept = tuple(s.detach().clone() if isinstance(s, Tensor) else s for s in sources)
                 entry = self._cache[key] = (kept, make(*args))
         return entry[1]
 
     def _rows(self, device: torch.device) -> DataRows:
         """Return the rows of the data; weights that learn leave them alone."""
-        if carries_derivative(self.data.matrices):
+        if is_fleeting(self.data.matrices):
             return _rows_of(self.data, device, self.terms)
         return self._cached(("rows", device), (self.data,), _rows_of, self.data, device, self.terms)
 

@@ -9,7 +9,7 @@ from torch import Tensor
 def times(matrix: Tensor, x: Tensor) -> Tensor:
     """Return matrix x for vectors `(*batch, n)`; the matrix is `(m, n)`, shared, or `(*batch, m, n)`."""
     if matrix.ndim == 2:
-        # Not x @ matrix.mT, which makes a vector a matrix on the way: the older `vmap` loses a forward derivative there.
+        # Not x @ matrix.mT, which makes the vector a matrix, where the older `vmap` loses a forward derivative.
         return matrix.mv(x) if x.ndim == 1 else x @ matrix.mT
     return (matrix @ x[..., None])[..., 0]
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 import torch
@@ -46,6 +47,31 @@ def is_grads_batched(tensor: Tensor) -> bool:
     That is an older `vmap`, which does not look for the rules of a Function: its tensors stand plain operations alone.
     """
     return _is_legacy_batched(tensor)
+
+
+def is_fleeting(values: tuple[Any, ...]) -> bool:
+    """Return whether what is made of these values must not outlive the call: they have a derivative or a wrapper."""
+    if _are_transforms_active() and not all(is_plain(value) for value in values if isinstance(value, Tensor)):
+        return True
+    return carries_derivative(values)
+
+
+def untransformed() -> contextlib.AbstractContextManager[Any]:
+    """Return a context without transforms, for what outlives the call; there every tensor must be plain.
+
+    Within one, even a new tensor is wrapped, and its wrapper is no good once the transform has ended.
+    """
+    return getattr(torch._C, "_DisableFuncTorch", contextlib.nullcontext)()
+
+
+def constant(tensor: Tensor) -> Tensor:
+    """Return a tensor's numbers, without its graph, its tangent, and the wrappers of `torch.func.grad` and `jvp`."""
+    if _functorch is None or not _are_transforms_active():
+        return tensor.detach()
+    with untransformed():
+        while _functorch.is_gradtrackingtensor(tensor):
+            tensor = _functorch.get_unwrapped(tensor)
+        return tensor.detach()
 
 
 def carries_derivative(values: tuple[Any, ...]) -> bool:

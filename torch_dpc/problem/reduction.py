@@ -26,6 +26,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..transforms import constant, untransformed
 from .rows import DataRows
 from .saddle import Saddle, known_solution
 from .weights import Weights, psd_root
@@ -67,9 +68,10 @@ class Reduction:
 
         With a graph G is C A_lam; here it is Ct Ct' in any case, which loses less, so that a graph changes no result.
         """
-        rows, weights = (part.map(lambda tensor, _: tensor.detach()) for part in (self.rows, self.weights))
-        plain = _map_tensors(self, Tensor.detach)
-        return replace(plain, G=plain.Ct @ plain.Ct.mT, rows=rows, weights=weights)
+        rows, weights = (part.map(lambda tensor, _: constant(tensor)) for part in (self.rows, self.weights))
+        plain = _map_tensors(self, constant)
+        with untransformed():
+            return replace(plain, G=plain.Ct @ plain.Ct.mT, rows=rows, weights=weights)
 
     def of_batch(self, batch: torch.Size) -> Reduction:
         """Return one problem a sample of a flattened batch; itself where all samples share one problem."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any
+from typing import Any, NoReturn
 
 import torch
 from torch import Tensor
@@ -233,19 +233,53 @@ class _InRowSpace(torch.autograd.Function):
     D_bar = bar B'. A derivative of that is refused.
     """
 
+    generate_vmap_rule = True
+
     @staticmethod
     def forward(D: Tensor, basis: Tensor) -> Tensor:  # noqa: D102
         return D @ basis
 
     @staticmethod
-    def setup_context(ctx: object, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:  # noqa: D102
-        ctx.save_for_backward(inputs[1])  # type: ignore[attr-defined]
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:  # noqa: D102
+        ctx.save_for_backward(inputs[1])
 
     @staticmethod
-    def backward(ctx: object, bar: Tensor) -> tuple[Tensor, None]:  # noqa: D102
-        if torch.is_grad_enabled() and bar.requires_grad:
-            raise NotImplementedError(
-                "the derivative with respect to the recorded data is of first order: it cannot be taken with "
-                "`create_graph=True`. Detach the data, or ask for first derivatives."
-            )
-        return bar @ ctx.saved_tensors[0].mT, None  # type: ignore[attr-defined]
+    def backward(ctx: Any, bar: Tensor) -> tuple[Tensor, None]:  # noqa: D102
+        (basis,) = ctx.saved_tensors
+        return _DataCotangent.apply(bar, basis) if torch.is_grad_enabled() else bar @ basis.mT, None
+
+    @staticmethod
+    def jvp(ctx: Any, *_: Any) -> Tensor:  # noqa: D102
+        raise NotImplementedError(
+            "derivatives with respect to the recorded data go backward: take them by `.backward()`, "
+            "`torch.autograd.grad`, `torch.func.grad` or `jacrev`, not by `jvp`, `jacfwd` or `hessian`."
+        )
+
+
+class _DataCotangent(torch.autograd.Function):
+    """(bar, B) -> bar B', once: `torch.func` asks for every derivative as one to be derived, and most are not."""
+
+    generate_vmap_rule = True
+
+    @staticmethod
+    def forward(bar: Tensor, basis: Tensor) -> Tensor:  # noqa: D102
+        return bar @ basis.mT
+
+    @staticmethod
+    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:  # noqa: D102
+        pass
+
+    @staticmethod
+    def backward(ctx: Any, *_: Tensor) -> tuple[Tensor, None]:  # noqa: D102
+        _DataCotangent._refuse()
+
+    @staticmethod
+    def jvp(ctx: Any, *_: Any) -> Tensor:  # noqa: D102
+        _DataCotangent._refuse()
+
+    @staticmethod
+    def _refuse() -> NoReturn:
+        raise NotImplementedError(
+            "the derivative with respect to the recorded data is of first order, and cannot be derived again: detach "
+            "it or the data."
+        )

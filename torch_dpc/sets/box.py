@@ -8,8 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .base import ConvexSet
 from ..transforms import is_mapped
+from .base import ConvexSet
 from .parameters import as_bound, as_tensor, short
 
 
@@ -57,6 +57,13 @@ class Box(ConvexSet):
                     f"the bounds of `{name}` must be numbers or have shape ({channels},), ({steps}, {channels}) or "
                     f"(*batch, {steps}, {channels}), got {tuple(bound.shape)}."  # type: ignore[union-attr]
                 )
+
+    def check_values(self) -> None:
+        self.check_bounds()
+
+    def is_point(self, x: Tensor) -> Tensor:
+        lower, upper = self.bounds(x)
+        return (lower == upper).expand_as(x)
 
     def check_bounds(self) -> None:
         """Raise ValueError unless lower <= upper and a finite point lies between; bounds that `vmap` maps go unseen."""
@@ -159,7 +166,12 @@ class SoftBox(ConvexSet):
         super().__init__()
         self.box = Box(lower, upper)
         self.weight = as_bound("weight", weight)
-        if not bool((as_tensor(self.weight).detach() > 0).all()):
+        self.check_values()
+
+    def check_values(self) -> None:
+        self.box.check_bounds()
+        # NaN is not positive either.
+        if not is_mapped(self.weight) and not bool((as_tensor(self.weight).detach() > 0).all()):
             raise ValueError("`weight` must be positive: without a price there is no bound.")
 
     def project(self, x: Tensor) -> Tensor:

@@ -14,6 +14,7 @@ from ..linear import lead_all, times
 from ..problem.compact_form import Sizes
 from ..problem.reduction import Reduction
 from ..sets.feasible import FeasibleSet
+from ..transforms import untransformed
 from .infeasibility import separates_from_set
 from .optimality import BATCHED, WEAKLY_ACTIVE, Optimality
 from .projected_system import Implicit, solve_system
@@ -45,7 +46,8 @@ class ConvexSolver:
     @cached_property
     def gamma(self) -> Tensor:
         """The scale of the multipliers, `(N,)`."""
-        return scale_of(self._G, self.sets)
+        with untransformed():  # the first call may be within a transform, the next one outside of it
+            return scale_of(self._G, self.sets)
 
     @cached_property
     def _G(self) -> Tensor:
@@ -75,6 +77,7 @@ class ConvexSolver:
             ValueError: values that are not finite.
             InfeasibleError, SolveError: with `on_failure="raise"`, if a sample has no accepted solution.
         """
+        self.sets.check_values()
         # As they are now: the backward must not see what the sets become later.
         sets, gamma = self.sets.snapshot(), self.gamma
         order, inverse = sets.order.to(theta.device), sets.inverse.to(theta.device)
@@ -115,7 +118,7 @@ class ConvexSolver:
         raw = times(self.reduction.rows.C, a)
         v = sets.prox(raw[..., order] + lam)
         residual = self._optimality.residual(
-            theta, a, raw, v[..., sets.inverse.to(theta.device)], v0, lam[..., sets.inverse.to(theta.device)]
+            theta, a, a0, raw, v[..., sets.inverse.to(theta.device)], v0, lam[..., sets.inverse.to(theta.device)]
         )
         # A multiplier that moves nothing holds nothing: its rows count as inactive, as at a box.
         reach = WEAKLY_ACTIVE

@@ -33,7 +33,7 @@ CONVERGED = 1e-13
 #: |F| above which, relative to 1 + |v|, a sample is worth another way.
 GOOD = 1e-10
 #: Penalties of the augmented Lagrangian, in units of 1 / gamma: the first, the largest, the growth; and its rounds.
-PENALTY, LARGEST_PENALTY, GROWTH, ROUNDS = 1.0, 1e6, 10.0, 60
+PENALTY, LARGEST_PENALTY, GROWTH, ROUNDS = 1.0, 1e9, 10.0, 60
 #: Newton steps on one augmented Lagrangian, the slope at which it is solved, and bisections of a line search.
 INNER_STEPS, FLAT, BISECTIONS = 40, 1e-12, 40
 #: What rounding leaves of a slope, relative to its terms.
