@@ -26,6 +26,7 @@ from .errors import Status
 from .linear import flatten_batch, lead_all, outer, times, unit_vectors
 from .problem.projected_kkt import FullAdjoint
 from .problem.reduction import Reduction
+from .sets.parameters import check_order
 from .solve import kernels
 from .solve.active_set import adjoint, solve_active
 from .solve.solver import Planned, Solver
@@ -156,6 +157,9 @@ class SolveReduced(torch.autograd.Function):
         theta, lower, upper = lead_all(
             (theta, lower, upper), (in_dims[0], in_dims[4], in_dims[5]), (1, 1, 1), info.batch_size
         )
+        if in_dims[4] is not None or in_dims[5] is not None:
+            assert lower is not None and upper is not None
+            check_order(lower, upper)  # the box could not look at them
         outputs = SolveReduced.apply(theta, A, C, G, lower, upper, solver)
         return outputs, (0,) * len(outputs)
 

@@ -30,6 +30,22 @@ def is_mapped(value: Any) -> bool:
     return isinstance(value, Tensor) and _is_legacy_batched(value)
 
 
+def refuse_forward_twice() -> None:
+    """Raise NotImplementedError within a forward derivative of a forward derivative.
+
+    Within the `jvp` of a Function torch keeps no other tangent: what the `jvp` itself depends on is lost, without a word.
+    Where it depends on nothing, as at boxes with constant weights, this does not matter.
+    """
+    if _functorch is None:
+        return
+    stack = _functorch.get_interpreter_stack() or []
+    if sum(level.key() == _functorch.TransformType.Jvp for level in stack) > 1:
+        raise NotImplementedError(
+            "forward derivatives of forward derivatives (jacfwd of jacfwd, jvp of jvp) are there for boxes with "
+            "constant weights: take one of the two backward, as `hessian` does."
+        )
+
+
 def apply_function(function: type[torch.autograd.Function], *args: Any) -> Any:
     """Return `function.apply(*args)`.
 

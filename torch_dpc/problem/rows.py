@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
-from typing import Any, NoReturn
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -21,6 +21,7 @@ from torch import Tensor
 from ..data.hankel import HankelData
 from ..linear import times
 from ..transforms import carries_derivative
+from .data_derivative import in_row_space
 
 #: How far u_ini may be from what the data can produce, relative to its norm.
 REACHABLE = 1e-8
@@ -161,7 +162,7 @@ class DataRows:
             )
         basis = space.basis.to(device)
         stacked = data.stacked.to(device)
-        rows = _InRowSpace.apply(stacked, basis) if carries_derivative(data.matrices) else stacked @ basis
+        rows = in_row_space(stacked, basis) if carries_derivative(data.matrices) else stacked @ basis
         Up, Yp, Uf, Yf = rows.split([len(m) for m in data.matrices])
         u_ref = len(Up) + len(Yp)
         y_ref = u_ref + len(Uf)
@@ -224,62 +225,3 @@ def _eliminate(Eq: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         pinv = (right_h[:rank].T / singular[:rank]) @ left[:, :rank].T
         reached = None if rank == len(Eq) else left[:, :rank].contiguous()
         return pinv, right_h[rank:].T.contiguous(), reached
-
-
-class _InRowSpace(torch.autograd.Function):
-    """(D, B) -> D B for an orthonormal basis B of the rows of D, which moves with D.
-
-    What follows depends on D through D D' alone, so that to first order, and only so, B may be taken as fixed:
-    D_bar = bar B'. A derivative of that is refused.
-    """
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(D: Tensor, basis: Tensor) -> Tensor:  # noqa: D102
-        return D @ basis
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:  # noqa: D102
-        ctx.save_for_backward(inputs[1])
-
-    @staticmethod
-    def backward(ctx: Any, bar: Tensor) -> tuple[Tensor, None]:  # noqa: D102
-        (basis,) = ctx.saved_tensors
-        return _DataCotangent.apply(bar, basis) if torch.is_grad_enabled() else bar @ basis.mT, None
-
-    @staticmethod
-    def jvp(ctx: Any, *_: Any) -> Tensor:  # noqa: D102
-        raise NotImplementedError(
-            "derivatives with respect to the recorded data go backward: take them by `.backward()`, "
-            "`torch.autograd.grad`, `torch.func.grad` or `jacrev`, not by `jvp`, `jacfwd` or `hessian`."
-        )
-
-
-class _DataCotangent(torch.autograd.Function):
-    """(bar, B) -> bar B', once: `torch.func` asks for every derivative as one to be derived, and most are not."""
-
-    generate_vmap_rule = True
-
-    @staticmethod
-    def forward(bar: Tensor, basis: Tensor) -> Tensor:  # noqa: D102
-        return bar @ basis.mT
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:  # noqa: D102
-        pass
-
-    @staticmethod
-    def backward(ctx: Any, *_: Tensor) -> tuple[Tensor, None]:  # noqa: D102
-        _DataCotangent._refuse()
-
-    @staticmethod
-    def jvp(ctx: Any, *_: Any) -> Tensor:  # noqa: D102
-        _DataCotangent._refuse()
-
-    @staticmethod
-    def _refuse() -> NoReturn:
-        raise NotImplementedError(
-            "the derivative with respect to the recorded data is of first order, and cannot be derived again: detach "
-            "it or the data."
-        )

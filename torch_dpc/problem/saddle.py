@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from ..linear import lead_all
+from ..transforms import constant, refuse_forward_twice
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,8 +44,9 @@ class Saddle:
 
 def known_solution(Psi: Tensor, Eq: Tensor, top: Tensor, bottom: Tensor, a: Tensor, saddle: Saddle) -> Tensor:
     """Return the solution `a`, computed elsewhere to full precision, with the derivative of the solve attached."""
+    refuse_forward_twice()
     # mu is seen by the cotangent of Eq alone, and costs as much as the rest.
-    mu = saddle.multipliers(Psi.detach(), top.detach(), a) if Eq.requires_grad else torch.zeros_like(bottom)
+    mu = saddle.multipliers(constant(Psi), constant(top), a) if Eq.requires_grad else torch.zeros_like(bottom)
     solved, _ = _SaddleSolve.apply(Psi, Eq, top, bottom, a, mu, saddle.T, saddle.Z, saddle.Eq_pinv)
     return solved
 

@@ -10,7 +10,7 @@ from torch import Tensor
 
 from ..transforms import is_mapped
 from .base import ConvexSet
-from .parameters import as_bound, as_tensor, short
+from .parameters import as_bound, as_tensor, check_order, short
 
 
 class Box(ConvexSet):
@@ -66,14 +66,8 @@ class Box(ConvexSet):
         return (lower == upper).expand_as(x)
 
     def check_bounds(self) -> None:
-        """Raise ValueError unless lower <= upper and a finite point lies between; bounds that `vmap` maps go unseen."""
-        if is_mapped(self.lower) or is_mapped(self.upper):
-            return
-        lower, upper = (as_tensor(bound).detach().double().cpu() for bound in (self.lower, self.upper))
-        if not bool((lower <= upper).all()):
-            raise ValueError("`lower` must be at most `upper` in every component, got crossed or NaN bounds.")
-        if bool((lower == math.inf).any()) or bool((upper == -math.inf).any()):
-            raise ValueError("`lower` must be below +infinity and `upper` above -infinity.")
+        """Raise ValueError unless lower <= upper with a finite point between; the solve tells of what `vmap` maps."""
+        check_order(as_tensor(self.lower), as_tensor(self.upper))
 
     def project(self, x: Tensor) -> Tensor:
         lower, upper = self.bounds(x)

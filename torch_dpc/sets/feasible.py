@@ -12,7 +12,7 @@ from torch import Tensor, nn
 
 from ..transforms import is_mapped, is_plain
 from .base import ConvexSet, Part
-from .box import Box
+from .box import Box, SoftBox
 
 #: The Jacobian of the projection, part by part: its diagonal `(..., groups, size)` where the set is separable, blocks
 #: `(..., groups, size, size)` otherwise.
@@ -87,6 +87,11 @@ class FeasibleSet:
     def is_box(self) -> bool:
         """Whether all sets together are a box."""
         return all(isinstance(owner, Box) for owner, _ in self.parts)
+
+    @property
+    def is_piecewise_affine(self) -> bool:
+        """Whether the projection certainly is: its Jacobian then has no derivative."""
+        return all(isinstance(owner, (Box, SoftBox)) for owner, _ in self.parts)
 
     def bounds(self, device: torch.device) -> tuple[Tensor, Tensor]:
         """Return lower and upper of v where the sets are a box, `(..., N)` each, float64, with their graph."""

@@ -14,7 +14,7 @@ from ..linear import lead_all, times
 from ..problem.compact_form import Sizes
 from ..problem.reduction import Reduction
 from ..sets.feasible import FeasibleSet
-from ..transforms import untransformed
+from ..transforms import refuse_forward_twice, untransformed
 from .infeasibility import separates_from_set
 from .optimality import BATCHED, WEAKLY_ACTIVE, Optimality
 from .projected_system import Implicit, solve_system
@@ -78,6 +78,8 @@ class ConvexSolver:
             InfeasibleError, SolveError: with `on_failure="raise"`, if a sample has no accepted solution.
         """
         self.sets.check_values()
+        if not self.sets.is_piecewise_affine:
+            refuse_forward_twice()
         # As they are now: the backward must not see what the sets become later.
         sets, gamma = self.sets.snapshot(), self.gamma
         order, inverse = sets.order.to(theta.device), sets.inverse.to(theta.device)
