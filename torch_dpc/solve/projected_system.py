@@ -170,8 +170,8 @@ class Implicit(torch.autograd.Function):
         sets = ctx.sets
         if sets.versions() != ctx.versions:
             raise RuntimeError(
-                "a parameter of a set (a bound, a radius, ...) was changed in place between the plan and its derivative: "
-                "take the derivative first."
+                "a parameter of a set (a bound, a radius, ...) was changed in place between the plan and its "
+                "derivative: take the derivative first."
             )
         x = torch.where(solved, v, 0.0) + ctx.gamma * lam
         return sets.freed(sets.jacobians(x, ctx.gamma), weak)
