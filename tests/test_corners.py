@@ -1,4 +1,4 @@
-"""Where problems are at their edges: a plant at rest on its bound, huge multipliers, sets that are points, sets that change."""
+"""Problems at their edges: a plant at rest on its bound, huge multipliers, sets that are points, sets that change."""
 
 import math
 
@@ -25,9 +25,10 @@ def first_order_lag():
     return dpc.HankelData.from_trajectories(u, y, t_ini=3, horizon=8)
 
 
-@pytest.mark.parametrize(
-    "y_set", [dpc.NonNegative(), dpc.Box(0.0, 10.0), dpc.Ball(0.0), dpc.SecondOrderCone()], ids=lambda s: type(s).__name__
-)
+HALF_LINES = [dpc.NonNegative(), dpc.Box(0.0, 10.0), dpc.Ball(0.0), dpc.SecondOrderCone()]
+
+
+@pytest.mark.parametrize("y_set", HALF_LINES, ids=lambda y_set: type(y_set).__name__)
 @pytest.mark.parametrize("start", [0.0, -1.0])
 def test_a_plant_at_rest_on_its_bound_has_a_plan(y_set, start):
     """The plan is zero and so is g: rounding must not be judged relative to itself."""
@@ -44,7 +45,7 @@ def integrator(seed):
 
 @pytest.mark.parametrize("seed", range(5))
 def test_what_one_sided_sets_exclude_is_proven(seed):
-    """The last input was (-0.5, 1): with changes of at most 0.2 the first is negative. A bound is missing on one side."""
+    """The last input was (-0.5, 1): with changes of at most 0.2 the next one is negative."""
     data, y_ini = integrator(seed)
     u_ini = torch.zeros(3, 2, dtype=torch.float64)
     u_ini[-1] = number(-0.5, 1.0)
