@@ -1,6 +1,6 @@
 """Weights that hold under attack: Pareto front of nominal against attacked error, before and after; beyond the paper.
 
-    python scripts/tune_regularization.py                   # about 5 minutes on two cores
+    python scripts/tune_regularization.py                   # about 6 minutes on two cores
     python scripts/tune_regularization.py --plants masses --quick
 
 lambda_g, lambda_s and the diagonals of Q and R are tuned on recorded windows of three training recordings
@@ -164,7 +164,10 @@ def tune_plant(plant: str, out: Path, seeds: int, workers: int, steps: int = STE
     chosen = {c.name: choose(points.rows(), runs.rows(), c) for c in cases}
     jobs = [job for c in cases for job in other_jobs(c, {chosen[c.name]: tuned[c.name][chosen[c.name]]}, seeds)]
     close_loops(runs, jobs, workers, f"{plant}, other attacks")
-    write_report(out / stem, cases, points.rows(), course.rows(), runs.rows(), versions(seeds, workers))
+    note = (
+        versions(seeds, workers).split(";")[0] + f"; held-out recordings {HELD_OUT_FROM} to {HELD_OUT_FROM + seeds - 1}"
+    )
+    write_report(out / stem, cases, points.rows(), course.rows(), runs.rows(), note)
 
 
 def close_loops(runs: Table, jobs: list[tuple[Any, ...]], workers: int, label: str) -> None:
