@@ -14,7 +14,6 @@ from ..attacks.budgets import Budget
 from ..attacks.costs import Cost, at_step
 from ..checks import as_data, check_count
 from ..errors import Status
-from ..hankel import HankelData
 from ..layer import DPCLayer
 from ..reduction import Reduction
 from ..solve import Solver
@@ -107,8 +106,6 @@ class RobustObjective:
         self.layer, self.budget, self.psi, self.attack = layer, budget, psi, attack
         self.plans, self.replan_every, self.iterations = plans, replan_every, iterations
         self.attacked_weight, self.through = attacked_weight, through
-        if not isinstance(layer.data, HankelData):
-            raise ValueError(f"`layer` must plan with one data set, got {type(layer.data).__name__}.")
         self.predictor = DataPredictor(layer.data) if predictor is None else predictor
         self.cost = _own_cost(layer) if cost is None else cost
         self.u_ini, self.y_ini = _past(windows)
