@@ -1,6 +1,6 @@
 """Weights that hold under attack: Pareto front of nominal against attacked error, before and after; beyond the paper.
 
-    python scripts/tune_regularization.py                   # about 6 minutes on two cores
+    python scripts/tune_regularization.py                   # 11 minutes on two cores, busy with other work too
     python scripts/tune_regularization.py --plants masses --quick
 
 lambda_g, lambda_s and the diagonals of Q and R are tuned on recorded windows of three training recordings
