@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 from typing import Any
@@ -158,7 +159,11 @@ class DPCLayer(nn.Module):
 
     @property
     def full_kkt_size(self) -> int:
-        """Unknowns of the paper's system: 2 horizon (n_u + n_y) + t_ini n_u + n_g."""
+        """Unknowns of the paper's system: 2 horizon (n_u + n_y) + t_ini n_u + n_g.
+
+        Raises:
+            ValueError: the data sets of a batch have different n_g.
+        """
         data = self.data
         return 2 * data.horizon * (data.n_u + data.n_y) + data.t_ini * data.n_u + data.n_g
 
@@ -222,12 +227,13 @@ class DPCLayer(nn.Module):
         self, planned: Planned, theta: Tensor, reduction: Reduction, solver: Any, dtype: torch.dtype
     ) -> DPCSolution:
         u, y, lam, _, info = planned
+        data = self.data  # g is made later, and is of these
         return DPCSolution(
             u=u if dtype == torch.float64 else u.to(dtype),
             y=y if dtype == torch.float64 else y.to(dtype),
-            info=SolveInfo(info, reduction.is_selection, lambda: self._nonsingular(solver, theta, planned)),
+            info=SolveInfo(info, reduction.is_selection, lambda: _nonsingular(data, solver, theta, planned)),
             lam=lam,
-            _make_g=lambda: self._g(reduction, theta, lam, info).to(dtype),
+            _make_g=lambda: _g(data, reduction, theta, lam, info).to(dtype),
         )
 
     def compact_form(self, u_ini: Any, y_ini: Any, *, y_ref: Any = None, u_ref: Any = None) -> CompactForm:
@@ -266,6 +272,8 @@ class DPCLayer(nn.Module):
         """Write the layer to a safetensors file: weights, sets, settings and the data, without pickle.
 
         Parameters, tensors and numbers come back as what they are; of a tensor that a graph made, its value is kept.
+        So it is with what `torch.nn.utils.parametrize` makes: the present value comes back, a plain tensor, without
+        its parametrisation.
 
         Args:
             path: of the file, which is replaced.
@@ -273,7 +281,9 @@ class DPCLayer(nn.Module):
                 whatever the number of windows, plans are the same, and `sol.g` raises.
 
         Raises:
-            ValueError: a set that is not known (:func:`torch_dpc.register_set`); windows asked of compact data.
+            ValueError: a set that is not known (:func:`torch_dpc.register_set`); windows asked of compact data;
+                settings that do not go together.
+            OSError: the file cannot be written.
             ImportError: safetensors is missing.
         """
         save_layer(self, path, data=data)
@@ -291,8 +301,13 @@ class DPCLayer(nn.Module):
 
     def extra_repr(self) -> str:
         """Describe the data and the sizes of the systems that are solved."""
+        sizes = ""
+        for name in ("reduced_kkt_size", "full_kkt_size"):
+            # Settings under change may not fit, and the data sets of a batch may differ: neither has a size to show.
+            with contextlib.suppress(ValueError):
+                sizes += f", {name}={getattr(self, name)}"
         return (
-            f"{self.data!r}, reduced_kkt_size={self.reduced_kkt_size}, full_kkt_size={self.full_kkt_size}, "
+            f"{self.data!r}{sizes}, "
             f"backward={self.backward_system!r}, solver={self.solver!r}, on_failure={self.on_failure!r}"
         )
 
@@ -396,22 +411,24 @@ class DPCLayer(nn.Module):
         """Leave the factors out of copies and pickles: they are made again when needed."""
         return {**self.__dict__, "_cache": {}, "_setup_cache": None}
 
-    def _nonsingular(self, solver: Any, theta: Tensor, planned: Planned) -> Tensor:
-        reduction, data = solver.reduction, self.data
-        # The part of g that the data do not see is fixed by lambda_g alone.
-        fixed = (reduction.weights.lambda_g > 0) | (torch.as_tensor(data.rank) == data.n_g)
-        decided = reduction.rows.Eq_range is None and not reduction.is_selection
-        with torch.no_grad():
-            return solver.independent(theta.detach(), planned) & fixed & decided
 
-    def _g(self, reduction: Reduction, theta: Tensor, lam: Tensor, info: Tensor) -> Tensor:
-        self.data.require_windows()
-        a = times(reduction.A_theta, theta) - times(reduction.A_lam, lam)
-        g = times(basis := self.data.basis.to(a.device), a)
-        if reduction.rows.C.requires_grad:  # g = D^+ (D g), so that the data behind D are differentiated too
-            D = self.data.stacked.to(a.device)
-            g = times(torch.linalg.pinv(D, rtol=1e-10), times(D @ basis, a))
-        return torch.where(info[..., :1] == Status.SOLVED, g, torch.nan)
+def _nonsingular(data: HankelData | HankelBatch, solver: Any, theta: Tensor, planned: Planned) -> Tensor:
+    reduction = solver.reduction
+    # The part of g that the data do not see is fixed by lambda_g alone.
+    fixed = (reduction.weights.lambda_g > 0) | data.spans_all.to(theta.device)
+    decided = reduction.rows.Eq_range is None and not reduction.is_selection
+    with torch.no_grad():
+        return solver.independent(theta.detach(), planned) & fixed & decided
+
+
+def _g(data: HankelData | HankelBatch, reduction: Reduction, theta: Tensor, lam: Tensor, info: Tensor) -> Tensor:
+    data.require_windows()
+    a = times(reduction.A_theta, theta) - times(reduction.A_lam, lam)
+    g = times(basis := data.basis.to(a.device), a)
+    if reduction.rows.C.requires_grad:  # g = D^+ (D g), so that the data behind D are differentiated too
+        D = data.stacked.to(a.device)
+        g = times(torch.linalg.pinv(D, rtol=1e-10), times(D @ basis, a))
+    return torch.where(info[..., :1] == Status.SOLVED, g, torch.nan)
 
 
 def _rows_of(data: HankelData | HankelBatch, device: torch.device, terms: Terms) -> DataRows:
