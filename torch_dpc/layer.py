@@ -116,7 +116,7 @@ class DPCLayer(nn.Module):
         weights = self._weights(cpu)  # bad weights and bounds are told now, not at the first call
         if self._setup.is_box:
             self.bounds(cpu)
-        one_batch([*self._batches_of(weights), *self.feasible_set.batches])
+        one_batch([*self._batches_of(weights), *self.feasible_set.batches(cpu)])
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Assign; a setting is checked first, as the constructor checks it."""
@@ -131,6 +131,15 @@ class DPCLayer(nn.Module):
         if kept is None or kept[0] != now:
             kept = self._setup_cache = (now, Setup.of(self))
         return kept[1]
+
+    @property
+    def backward(self) -> str:
+        """The system that the backward solves, "reduced" or "full"; may be assigned."""
+        return self.backward_system
+
+    @backward.setter
+    def backward(self, value: str) -> None:
+        self.backward_system = value
 
     @property
     def terms(self) -> Terms:
@@ -195,7 +204,8 @@ class DPCLayer(nn.Module):
         if self._setup.is_box:
             return self.plan(theta, *self.bounds(theta.device), dtype=dtype, on_failure=on_failure)
         reduction, solver = self._factors(theta.device)
-        one_batch([("the samples", theta.shape[:-1]), *self._batches_of(reduction.weights), *self.feasible_set.batches])
+        batches = [("the samples", theta.shape[:-1]), *self._batches_of(reduction.weights)]
+        one_batch([*batches, *self.feasible_set.batches(theta.device)])
         planned = _with_failures(solver, on_failure).plan(theta, reduction)
         return self._solution(planned, theta, reduction, solver, dtype)
 
@@ -345,7 +355,7 @@ class DPCLayer(nn.Module):
 
     def _batches_of(self, weights: Weights) -> list[tuple[str, torch.Size]]:
         """Return the batch dimensions of the weights and of the data, by name."""
-        batches = [(name, tensor.shape[: tensor.ndim - weights.TAILS[name]]) for name, tensor in weights.tensors.items()]
+        batches = [(name, x.shape[: x.ndim - weights.TAILS[name]]) for name, x in weights.tensors.items()]
         if isinstance(self.data, HankelBatch):
             batches.append(("data", torch.Size([len(self.data.members)])))
         return batches

@@ -83,12 +83,21 @@ class FeasibleSet:
         """The batch dimensions that the sets' own parameters have."""
         return self.prox(torch.zeros(len(self.order), dtype=torch.float64)).shape[:-1]
 
-    @property
-    def batches(self) -> list[tuple[str, torch.Size]]:
-        """The batch dimensions that the parameters of each part have, by name."""
-        zeros = (torch.zeros(places.shape, dtype=torch.float64) for _, places in self.parts)
-        shapes = [owner.prox(zero, 1.0).shape[:-2] for (owner, _), zero in zip(self.parts, zeros, strict=True)]
-        return list(zip(self.names, shapes, strict=True))
+    def batches(self, device: torch.device) -> list[tuple[str, torch.Size]]:
+        """Return the batch dimensions that the parameters of each part have, by name.
+
+        Raises:
+            ValueError: a parameter of another shape was assigned since the sets were checked.
+        """
+        found = []
+        for (owner, places), name in zip(self.parts, self.names, strict=True):
+            try:
+                moved = owner.prox(torch.zeros(places.shape, dtype=torch.float64, device=device), 1.0)
+            except RuntimeError:
+                owner.check(name, *places.shape)
+                raise
+            found.append((name, moved.shape[:-2]))
+        return found
 
     @property
     def is_box(self) -> bool:

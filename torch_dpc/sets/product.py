@@ -82,5 +82,6 @@ def _pairs_of(factors: Any) -> list[tuple[ConvexSet, list[int]]]:
         if not isinstance(owner, ConvexSet):
             raise ValueError(f"{rule}, got {type(owner).__name__} for a set.")
         several = isinstance(channels, Iterable) and getattr(channels, "ndim", 1) > 0
-        pairs.append((owner, [as_index(f"{rule}; a channel is an integer", c) for c in (channels if several else [channels])]))
+        each = [as_index(f"{rule}; a channel is an integer", c) for c in (channels if several else [channels])]
+        pairs.append((owner, each))
     return pairs
