@@ -1,7 +1,7 @@
 """Train adversaries by backprop, a network in place of Algorithm 1, and judge them on what they have not seen.
 
-    python scripts/train_adversary.py --plant masses        # about 2 minutes on two cores
-    python scripts/train_adversary.py --plant quadrotor     # about 3 minutes
+    python scripts/train_adversary.py --plant masses        # about 1 minute on two cores
+    python scripts/train_adversary.py --plant quadrotor     # about 2 minutes
     torchrun --nproc-per-node 2 scripts/train_adversary.py --plant masses       # the same, each batch on two processes
 
 `--mode windows` trains through the layer on windows recorded in closed loop: Algorithm 1's direction is imitated, then
@@ -36,7 +36,7 @@ from _adversary_training import Stage, process_group, rank, read_tensors, train,
 from _common import arguments, read_rows, run_all, versions, write_rows
 from torch_dpc import attacks
 
-HIDDEN = [32, 32]
+HIDDEN = [16]
 # Iterations of each stage, windows and closed loops an iteration, runs recorded for training and for judging.
 FULL = {
     "masses": {

@@ -51,7 +51,7 @@ class AttackPolicy(nn.Module):
         self,
         data: HankelData,
         *,
-        hidden: Sequence[int] = (32, 32),
+        hidden: Sequence[int] = (16,),
         context: Any = None,
         looks: int = 5,
         scale: Tensor | None = None,

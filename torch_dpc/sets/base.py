@@ -27,6 +27,7 @@ _FOLLOWING = (
     "support",
     "bounded_direction",
     "slack",
+    "is_point",
 )
 
 
@@ -136,6 +137,13 @@ class ConvexSet(nn.Module):
             for shape in shapes:
                 if shape[-2:] != x.shape:
                     raise ValueError(f"{fits}: it projects {tuple(x.shape)} to {tuple(shape)}.")
+
+    def check_values(self) -> None:
+        """Raise ValueError where the parameters, as they are now, do not describe a set."""
+
+    def is_point(self, x: Tensor) -> Tensor:
+        """Return whether the set leaves x no choice, which is shaped as `slack(x)`: nothing then moves it."""
+        return torch.zeros_like(x[..., :1], dtype=torch.bool)
 
     def config(self) -> dict[str, Any]:
         """Return the arguments that make this set again; tensors are given as they are."""

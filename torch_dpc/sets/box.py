@@ -57,6 +57,13 @@ class Box(ConvexSet):
                     f"(*batch, {steps}, {channels}), got {tuple(bound.shape)}."  # type: ignore[union-attr]
                 )
 
+    def check_values(self) -> None:
+        self.check_bounds()
+
+    def is_point(self, x: Tensor) -> Tensor:
+        lower, upper = self.bounds(x)
+        return (lower == upper).expand_as(x)
+
     def check_bounds(self) -> None:
         """Raise ValueError unless lower <= upper and a finite point lies between."""
         lower, upper = (as_tensor(bound).detach().double().cpu() for bound in (self.lower, self.upper))
@@ -156,7 +163,11 @@ class SoftBox(ConvexSet):
         super().__init__()
         self.box = Box(lower, upper)
         self.weight = as_bound("weight", weight)
-        if not bool((as_tensor(self.weight).detach() > 0).all()):
+        self.check_values()
+
+    def check_values(self) -> None:
+        self.box.check_bounds()
+        if not bool((as_tensor(self.weight).detach() > 0).all()):  # NaN is not either
             raise ValueError("`weight` must be positive: without a price there is no bound.")
 
     def project(self, x: Tensor) -> Tensor:

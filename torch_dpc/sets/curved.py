@@ -29,6 +29,9 @@ class Ball(ConvexSet):
         super().__init__(per)
         self.radius = as_bound("radius", radius)
         self.center = as_bound("center", center)
+        self.check_values()
+
+    def check_values(self) -> None:
         value = as_tensor(self.radius).detach()
         if not bool((value >= 0).all()) or not bool(torch.isfinite(value).all()):
             raise ValueError("`radius` must be finite and not negative.")
@@ -56,7 +59,7 @@ class Ball(ConvexSet):
     def jacobian(self, x: Tensor, gamma: Any = 1.0) -> Tensor:
         _, direction, distance, radius = self._polar(x)
         eye = torch.eye(x.shape[-1], dtype=x.dtype, device=x.device)
-        outside = (distance > radius)[..., None]
+        outside = ((distance > radius) | (radius == 0))[..., None]
         shrink = (radius / torch.where(distance > radius, distance, 1.0))[..., None]
         return torch.where(outside, shrink * (eye - direction[..., :, None] * direction[..., None, :]), eye)
 
@@ -68,6 +71,10 @@ class Ball(ConvexSet):
     def slack(self, x: Tensor) -> Tensor:
         _, _, distance, radius = self._polar(x)
         return radius - distance
+
+    def is_point(self, x: Tensor) -> Tensor:
+        radius = self._polar(x)[-1]
+        return (radius == 0).expand_as(x[..., :1])
 
     def config(self) -> dict[str, Any]:
         return {"radius": self.radius, "center": self.center, "per": self.per}

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, cast
@@ -11,6 +11,7 @@ import torch
 from torch import Tensor, nn
 
 from ..checks import one_batch
+from ..transforms import is_plain
 from .base import ConvexSet, Part
 from .box import Box
 from .product import Product
@@ -50,6 +51,11 @@ class FeasibleSet:
             names += [name] * (len(parts) - len(names))
             start += steps * channels
         return FeasibleSet(parts, names)
+
+    def versions(self) -> list[int]:
+        """Return torch's count of the changes in place of every parameter of the sets."""
+        tensors = (x for owner, _ in self.parts for x in _tensors_of(owner))
+        return [x._version for x in tensors if is_plain(x.data if isinstance(x, nn.Parameter) else x)]
 
     def snapshot(self) -> FeasibleSet:
         """Return the same sets with the parameters that they have now."""
@@ -172,13 +178,22 @@ class FeasibleSet:
                 out.append(torch.where(free.all(-1)[..., None, None], eye, D))
         return out
 
+    def check_values(self) -> None:
+        """Raise ValueError where the parameters of a set, as they are now, do not describe one."""
+        for owner, _ in self.parts:
+            owner.check_values()
+
     def weak(self, x: Tensor, small: Tensor) -> Tensor:
-        """Return the rows whose multiplier is none: where `small` says so, whole groups unless the set is separable."""
+        """Return the rows whose multiplier is none: where `small` says so, whole groups unless the set is separable.
+
+        Where the set is a point its projection is constant, whatever the multiplier.
+        """
         out = []
         for owner, at, shape in self._slices:
             group = self._group(small, at, shape)
-            out.append((group if owner.separable else group.all(-1, keepdim=True).expand_as(group)).flatten(-2))
-        return torch.cat(out, dim=-1)
+            group = group if owner.separable else group.all(-1, keepdim=True).expand_as(group)
+            out.append((group & ~owner.is_point(self._group(x, at, shape))).flatten(-2))
+        return _joined(out)
 
     def touching(self, v: Tensor, weak: Tensor, reach: float) -> Tensor:
         """Return how many bounds v touches where `weak` says that no multiplier holds it there, `(...)`."""
@@ -282,6 +297,13 @@ def _snapshot(module: nn.Module) -> nn.Module:
     copy.__dict__["_buffers"] = dict(module._buffers)
     copy.__dict__["_modules"] = {k: None if m is None else _snapshot(m) for k, m in module._modules.items()}
     return copy
+
+
+def _tensors_of(module: nn.Module) -> Iterator[Tensor]:
+    """Yield the tensors that a module and its children hold, as parameters, buffers or attributes."""
+    for part in module.modules():
+        for holder in (part._parameters, part._buffers, part.__dict__):
+            yield from (x for x in holder.values() if isinstance(x, Tensor))
 
 
 def _joined(parts: list[Tensor]) -> Tensor:

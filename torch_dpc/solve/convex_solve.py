@@ -75,6 +75,7 @@ class ConvexSolver:
             ValueError: values that are not finite.
             InfeasibleError, SolveError: with `on_failure="raise"`, if a sample has no accepted solution.
         """
+        self.sets.check_values()
         # As they are now: the backward must not see what the sets become later.
         sets, gamma = self.sets.snapshot(), self.gamma
         order, inverse = sets.order.to(theta.device), sets.inverse.to(theta.device)
@@ -115,7 +116,7 @@ class ConvexSolver:
         raw = times(self.reduction.rows.C, a)
         v = sets.prox(raw[..., order] + lam)
         residual = self._optimality.residual(
-            theta, a, raw, v[..., sets.inverse.to(theta.device)], v0, lam[..., sets.inverse.to(theta.device)]
+            theta, a, a0, raw, v[..., sets.inverse.to(theta.device)], v0, lam[..., sets.inverse.to(theta.device)]
         )
         # A multiplier that moves nothing holds nothing: its rows count as inactive, as at a box.
         reach = WEAKLY_ACTIVE

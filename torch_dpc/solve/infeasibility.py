@@ -12,6 +12,8 @@ from .dual_active_set import SOLVED_FLAG, Daqp
 
 #: Directions of Ct below this fraction of the largest are none.
 DEPENDENT = 1e-10
+#: Entries of a direction below this fraction of its largest are rounding, and rounds of leaving those out.
+NOTHING, ROUNDS = 1e-12, 10
 #: By how much the certificate must separate, relative to the size of v0 and of the bounds.
 MARGIN = 1e-9
 #: A certificate whose Ct'd is not quite zero excludes only |x| below this, relative to the size of the problem.
@@ -31,6 +33,7 @@ def infeasibility_certificate(Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tens
     """
     Ct, v0, lower, upper = (x.detach().cpu() for x in (Ct, v0, lower, upper))
     scale = max(float(torch.linalg.matrix_norm(Ct, ord=2)), 1e-12) if Ct.numel() else 1.0
+    unbounded = torch.stack([upper.isinf(), lower.isinf()])
     no_equality = np.zeros(len(v0), dtype=np.int32)
     for eps in (1e-6, 1e-9, 1e-12):
         soft = eps**0.5 * scale * torch.eye(len(v0), dtype=Ct.dtype)
@@ -39,19 +42,29 @@ def infeasibility_certificate(Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tens
         if flag != SOLVED_FLAG:
             continue
         d = torch.from_numpy(lam)
-        if any(_separates(c, Ct, v0, lower, upper) for c in (d, _in_kernel(d, Ct))):
+        if any(_separates(c, Ct, v0, lower, upper) for c in (d, _in_kernel(d, Ct, unbounded))):
             return True
     return False
 
 
-def _in_kernel(d: Tensor, Ct: Tensor) -> Tensor:
-    """Return the nearest direction with Ct' d = 0 that uses no other rows: those without a bound must stay out."""
-    used = d.nonzero()[:, 0]
-    left, singular, _ = torch.linalg.svd(Ct[used], full_matrices=False)
-    span = left[:, singular > DEPENDENT * singular.max()] if singular.numel() else left
-    out = torch.zeros_like(d)
-    out[used] = d[used] - span @ (span.T @ d[used])
-    return out
+def _in_kernel(d: Tensor, Ct: Tensor, unbounded: Tensor) -> Tensor:
+    """Return a direction near d with Ct' d = 0 that uses no row without a bound on the side it points to.
+
+    Args:
+        d: `(N,)`.
+        Ct: `(N, n_x)`.
+        unbounded: whether the upper and the lower bound are missing, `(2, N)`.
+    """
+    for _ in range(ROUNDS):
+        d = torch.where(torch.where(d > 0, unbounded[0], unbounded[1]), 0.0, d)
+        d = torch.where(d.abs() > NOTHING * d.abs().amax(), d, 0.0)
+        used = d.nonzero()[:, 0]
+        left, singular, _ = torch.linalg.svd(Ct[used], full_matrices=False)
+        span = left[:, singular > DEPENDENT * singular.max()] if singular.numel() else left
+        d = torch.zeros_like(d).index_copy(0, used, d[used] - span @ (span.T @ d[used]))
+        if not bool((torch.where(d > 0, unbounded[0], unbounded[1]) & (d != 0)).any()):
+            break
+    return d
 
 
 def _separates(d: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> bool:

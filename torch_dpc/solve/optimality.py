@@ -31,7 +31,7 @@ WEAKLY_ACTIVE = 1e-9
 #: rounding of R (u - u_ref) and Q (y - y_ref): this fraction of |C| |(R, Q)| (|v| + |v_ref|) counts as a term too.
 CANCELLATION = 1e-3
 #: 2 lambda_s Yp'Yp a cannot be evaluated to better than a few units in the last place of lambda_s |Yp|^2 |a|; relative
-#: to the accepted residual, 1e-8, that is this fraction.
+#: to the accepted residual, 1e-8, that is this fraction. The same holds for G lam in v.
 ROUNDING = 1e-6
 
 
@@ -124,7 +124,7 @@ class Optimality:
         self._tracking = [
             (term.rows, None if weight is None else array(weight), _reference_of(term)) for term, weight in tracking
         ]
-        self._size_Eq = float(rows.Eq.norm())
+        self._size_Eq, self._size_G = float(rows.Eq.norm()), ROUNDING * float(reduction.G.norm())
         largest = max(float(w.abs().sum(-1).max()) for _, w in tracking if w is not None)  # bounds the norm
         self._floor = CANCELLATION * largest * float(rows.C.norm())
         self._rounding = ROUNDING * sum(
@@ -141,7 +141,7 @@ class Optimality:
         a = a0 - self._combine(lam, self._A_lam)
         raw = _times(self._C, a)
         v = self._clip(raw + lam, lower, upper)  # at a solution this is raw, and a row that lam holds is on its bound
-        residual = self.residual(theta, a, raw, v, v0, lam)
+        residual = self.residual(theta, a, a0, raw, v, v0, lam)
         reach = WEAKLY_ACTIVE * (1 + abs(v))
         # A difference to an infinite bound is infinite, and so never within reach.
         touching = (upper - v <= reach) | (v - lower <= reach)
@@ -150,18 +150,19 @@ class Optimality:
         n_active = self._count(active)
         return Judged(v, residual, active, n_active, self._count(touching) - n_active)
 
-    def residual(self, theta: Any, a: Any, v: Any, projected: Any, v0: Any, lam: Any) -> Any:
+    def residual(self, theta: Any, a: Any, a0: Any, v: Any, projected: Any, v0: Any, lam: Any) -> Any:
         """Return the sum over the blocks of |F| relative to its terms, given v = C a and Proj(v + lam)."""
         norm = self._norm
+        size_a = norm(a) + norm(a0)  # a is their difference: where it vanishes, what is left is their rounding
         # z - Proj_D(z - P z - q - H'w), the rows of u and y; u = Uf g and y = Yf g hold because v is C a
         size_v = norm(v)
-        in_set = norm(v - projected) / (size_v + norm(v0) + _TINY)
+        in_set = norm(v - projected) / (size_v + norm(v0) + self._size_G * norm(lam) + _TINY)
         # Up g = u_ini, and what else is held
         wanted = theta[..., self._Eq_theta]
-        held = norm(_times(self._Eq, a) - wanted) / (norm(wanted) + self._size_Eq * norm(a) + _TINY)
+        held = norm(_times(self._Eq, a) - wanted) / (norm(wanted) + self._size_Eq * size_a + _TINY)
         # 2 lambda_g M g + 2 lambda_s Yp'(Yp g - y_ini) + Uf'w_u + Yf'w_y, on the kernel of Up
         total, size_refs = self._tracked(theta, v, lam)
-        terms = norm(total) + self._floor * (size_v + size_refs) + self._rounding * norm(a)
+        terms = norm(total) + self._floor * (size_v + size_refs) + self._rounding * size_a
         for S, weight, measured in self._fits:
             of_rows, of_measured = _back(weight * _times(S, a), S), _back(weight * theta[..., measured], S)
             total = total + (of_rows - of_measured)

@@ -160,6 +160,7 @@ class Implicit(torch.autograd.Function):
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
         _, G, _, _, _, solved, weak, ctx.sets, ctx.gamma = inputs
+        ctx.versions = ctx.sets.versions()
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*output, G, solved, weak)
         ctx.save_for_forward(*output, G, solved, weak)
@@ -167,6 +168,11 @@ class Implicit(torch.autograd.Function):
     @staticmethod
     def _blocks(ctx: Any, v: Tensor, lam: Tensor, solved: Tensor, weak: Tensor) -> Blocks:
         sets = ctx.sets
+        if sets.versions() != ctx.versions:
+            raise RuntimeError(
+                "a parameter of a set (a bound, a radius, ...) was changed in place between the plan and its "
+                "derivative: take the derivative first."
+            )
         x = torch.where(solved, v, 0.0) + ctx.gamma * lam
         return sets.freed(sets.jacobians(x, ctx.gamma), weak)
 

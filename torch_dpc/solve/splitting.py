@@ -30,14 +30,17 @@ SPLITTING_STEPS = 20
 NEWTON_STEPS, HALVINGS = 25, 12
 #: |F| relative to 1 + |v| at which a sample has converged.
 CONVERGED = 1e-13
+#: |F| at which the augmented Lagrangian has done its part, and rounds that it may go on without halving |F|.
+CLOSE, PATIENCE = 1e-11, 20
 #: |F| above which, relative to 1 + |v|, a sample is worth another way.
 GOOD = 1e-10
 #: Penalties of the augmented Lagrangian, in units of 1 / gamma: the first, the largest, the growth; and its rounds.
-PENALTY, LARGEST_PENALTY, GROWTH, ROUNDS = 1.0, 1e6, 10.0, 60
+PENALTY, LARGEST_PENALTY, GROWTH, ROUNDS = 1.0, 1e9, 10.0, 60
 #: Newton steps on one augmented Lagrangian, the slope at which it is solved, and bisections of a line search.
 INNER_STEPS, FLAT, BISECTIONS = 40, 1e-12, 40
-#: What rounding leaves of a slope, relative to its terms.
-ROUNDING = 1e-15
+#: What rounding leaves of a slope at least, relative to its terms; near it (the second number is how near), steps that
+#: do not halve the slope any more (the third is how many) have found as much as there is.
+ROUNDING, FEW_ULPS, STALLED = 1e-16, 100.0, 3
 #: Newton steps up to which the penalty may grow.
 EASY = 20
 
@@ -89,7 +92,7 @@ def solve_convex(G: Tensor, Ct: Tensor, resolvent: Tensor, v0: Tensor, sets: Fea
         return found
     some = bad.nonzero()[:, 0] if v0.ndim == 2 and not sets.batch_shape else slice(None)
     G_bad, Ct_bad = (m if m.ndim == 2 else m[some] for m in (G, Ct))
-    lam, steps, gap = _augmented_lagrangian(Ct_bad, v0[some], sets, gamma)
+    lam, steps, gap = _augmented_lagrangian(G_bad, Ct_bad, v0[some], sets, gamma)
     polished, more, size = _newton(G_bad, v0[some], sets, gamma, lam)
     better = size < found.residual[some]
     found.lam[some] = torch.where(better[..., None], polished, found.lam[some])
@@ -145,24 +148,31 @@ def _newton(G: Tensor, v0: Tensor, sets: FeasibleSet, gamma: Tensor, lam: Tensor
     return lam, iterations, size
 
 
-def _augmented_lagrangian(Ct: Tensor, v0: Tensor, sets: FeasibleSet, gamma: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return multipliers, Newton steps, and the way from the sets to the trajectories."""
-    lam, gap = torch.zeros_like(v0), torch.zeros_like(v0)
+def _augmented_lagrangian(
+    G: Tensor, Ct: Tensor, v0: Tensor, sets: FeasibleSet, gamma: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return the best multipliers of any round, Newton steps, and the way from the sets to the trajectories."""
+    best, gap = torch.zeros_like(v0), torch.zeros_like(v0)
     steps = torch.zeros(v0.shape[:-1], dtype=torch.int64, device=v0.device)
+    least = torch.full(v0.shape[:-1], torch.inf, dtype=v0.dtype, device=v0.device)
     may_leave = v0.ndim == 2 and not sets.batch_shape
     rest: Tensor | slice = torch.arange(len(v0), device=v0.device) if may_leave else slice(None)
-    x = v0.new_zeros(*v0.shape[:-1], Ct.shape[-1])
-    penalty = torch.full((*v0.shape[:-1], 1), PENALTY, dtype=v0.dtype, device=v0.device)
-    norm = torch.linalg.vector_norm
+    lam, x = torch.zeros_like(v0), v0.new_zeros(*v0.shape[:-1], Ct.shape[-1])
+    penalty, idle = torch.full_like(least, PENALTY)[..., None], torch.zeros_like(steps)
     for _ in range(ROUNDS):
-        start, centre, C = lam[rest], v0[rest], Ct if Ct.ndim == 2 else Ct[rest]
+        centre, C, H = v0[rest], *(m if m.ndim == 2 else m[rest] for m in (Ct, G))
         reach = gamma / penalty  # the gamma of this round: w - P(w), over it, is the new multiplier
-        x, spent = _minimise(C, centre + reach * start, sets, reach, x)
-        w = centre + times(C, x) + reach * start
-        change = w - sets.prox(w, reach) - reach * start
-        lam[rest], gap[rest] = start + change / reach, change
-        steps[rest] += spent
-        stay = norm(change, dim=-1) > CONVERGED * (1 + norm(centre, dim=-1))
+        x, spent = _minimise(C, centre + reach * lam, sets, reach, x)
+        w = centre + times(C, x) + reach * lam
+        new = (w - sets.prox(w, reach)) / reach
+        gap[rest], steps[rest] = reach * (new - lam), steps[rest] + spent
+        lam = new
+        size = _residual(H, centre, sets, gamma, lam)[2]
+        better = size < least[rest]
+        best[rest] = torch.where(better[..., None], lam, best[rest])
+        idle = torch.where(size < 0.5 * least[rest], 0, idle + 1)
+        least[rest] = torch.where(better, size, least[rest])
+        stay = (size > CLOSE) & (idle < PATIENCE)
         if not bool(stay.any()):
             break
         # A problem that took many steps is hard enough: multipliers that move closer make the next one easier.
@@ -170,8 +180,8 @@ def _augmented_lagrangian(Ct: Tensor, v0: Tensor, sets: FeasibleSet, gamma: Tens
         penalty = torch.where(spent[..., None] < EASY, grown, penalty)
         penalty = torch.where(spent[..., None] == INNER_STEPS, penalty / GROWTH, penalty)
         if may_leave:
-            rest, x, penalty = rest[stay], x[stay], penalty[stay]  # type: ignore[index]
-    return lam, steps, gap
+            rest, lam, x, penalty, idle = rest[stay], lam[stay], x[stay], penalty[stay], idle[stay]  # type: ignore[index]
+    return best, steps, gap
 
 
 def _minimise(Ct: Tensor, shift: Tensor, sets: FeasibleSet, reach: Tensor, x: Tensor) -> tuple[Tensor, Tensor]:
@@ -184,17 +194,22 @@ def _minimise(Ct: Tensor, shift: Tensor, sets: FeasibleSet, reach: Tensor, x: Te
     gradient, w = slope(x)
     steps = torch.zeros(x.shape[:-1], dtype=torch.int64, device=x.device)
     norm = torch.linalg.vector_norm
-    eye = torch.eye(Ct.shape[-1], dtype=Ct.dtype, device=Ct.device)
-    size = norm(gradient, dim=-1)
-    rounding = ROUNDING * torch.linalg.matrix_norm(Ct)
+    may_leave = x.ndim == 2 and not sets.batch_shape
+    size = left = norm(gradient, dim=-1)
+    rounding, stalled = ROUNDING * torch.linalg.matrix_norm(Ct), torch.zeros_like(steps)
     for _ in range(INNER_STEPS):
         floor = FLAT * (size + norm(x, dim=-1)) + rounding * norm(w / reach, dim=-1)
-        todo = norm(gradient, dim=-1) > floor
+        now = norm(gradient, dim=-1)
+        stalled = torch.where(now < 0.5 * left, 0, stalled + 1)
+        left = torch.minimum(left, now)
+        todo = (now > floor) & ((stalled < STALLED) | (now > FEW_ULPS * floor))
         if not bool(todo.any()):
             break
-        curved = sets.complement_times(sets.jacobians(w, reach), Ct) / reach[..., None]
-        L, _ = torch.linalg.cholesky_ex(eye + Ct.mT @ curved)
-        step = -torch.cholesky_solve(gradient[..., None], L)[..., 0] * todo[..., None]
+        some = todo.nonzero()[:, 0] if may_leave else slice(None)
+        scale, C = (part if part.ndim == own else part[some] for part, own in ((reach, 1), (Ct, 2)))
+        step = torch.zeros_like(x)
+        step[some] = _newton_step(C, w[some], gradient[some], sets, scale)
+        step = step * todo[..., None]
         steps = steps + todo
         # The slope along the step grows from below zero: the minimum is where it vanishes, and 1 is tried first.
         low, high = torch.zeros_like(steps, dtype=x.dtype), torch.ones_like(steps, dtype=x.dtype)
@@ -210,3 +225,12 @@ def _minimise(Ct: Tensor, shift: Tensor, sets: FeasibleSet, reach: Tensor, x: Te
             length = torch.where(too_far | too_short, (low + high) / 2, length)
         x, gradient, w = trial, gradient_trial, w_trial
     return x, steps
+
+
+def _newton_step(Ct: Tensor, w: Tensor, gradient: Tensor, sets: FeasibleSet, reach: Tensor) -> Tensor:
+    """Return -(I + Ct' (I - D) Ct / reach)^-1 gradient."""
+    curved = sets.complement_times(sets.jacobians(w, reach), Ct) / reach[..., None]
+    rows = curved.abs().amax(-1).reshape(-1, curved.shape[-2]).amax(0).nonzero()[:, 0]  # few rows meet their bounds
+    eye = torch.eye(Ct.shape[-1], dtype=Ct.dtype, device=Ct.device)
+    L, _ = torch.linalg.cholesky_ex(eye + Ct[..., rows, :].mT @ curved[..., rows, :])
+    return -torch.cholesky_solve(gradient[..., None], L)[..., 0]

@@ -30,7 +30,9 @@ class DataPredictor:
         True
     """
 
-    def __init__(self, data: HankelData):
+    def __init__(self, data: Any):
+        if not isinstance(data, HankelData):
+            raise ValueError(f"`data` must be one HankelData, got {type(data).__name__}.")
         basis = data.row_space.basis[:, : data.row_space.rank_W]
         Up, Yp, Uf, Yf = (m.detach().double() @ basis for m in data.matrices)
         self.matrix = Yf @ torch.linalg.pinv(torch.cat([Up, Yp, Uf]))
