@@ -10,7 +10,8 @@ import torch
 
 import torch_dpc as dpc
 from _campaign_config import RunConfig
-from _tuning_cases import CASES, Case
+from _case import Case
+from _cases import CASES
 
 CASE_OF = {"masses": "held", "masses_moving": "moving", "quadrotor": "circle"}
 

@@ -9,10 +9,11 @@ from typing import Any
 import numpy as np
 from matplotlib.ticker import LogLocator, NullLocator
 
+from _case import Case
 from _plots import percent, plt, style
-from _tuning_cases import Case
 from _tuning_search import METHODS
 
+HELD_OUT, VALIDATED = "held out", "validation"
 ALLOWED = 1.10  # of the paper's nominal error
 LOWER = 0.99  # of the paper's attacked error: less than one per cent lower counts as the same
 ZERO = 1e-6  # [m]: a nominal error below this is none
@@ -36,7 +37,7 @@ def errors(runs: Rows, case: str, point: str, split: str, attack: str, rho: floa
     return np.array([chosen[seed] for seed in sorted(chosen)])
 
 
-def pair(runs: Rows, case: Case, point: str, split: str = "held out") -> tuple[np.ndarray, np.ndarray]:
+def pair(runs: Rows, case: Case, point: str, split: str = HELD_OUT) -> tuple[np.ndarray, np.ndarray]:
     """Return the nominal and the attacked errors of a point."""
     return tuple(errors(runs, case.name, point, split, *a) for a in (("nominal", 0.0), ("algorithm1", case.rho)))
 
@@ -47,12 +48,12 @@ def allowed(runs: Rows, case: Case, split: str) -> float:
 
 
 def choose(points: Rows, runs: Rows, case: Case) -> str:
-    """Return the point found through the attack that the training recordings recommend."""
-    limit = allowed(runs, case, "training")
+    """Return the point that the validation recordings recommend, whatever search found it."""
+    limit = allowed(runs, case, VALIDATED)
     candidates = {}
     for row in points:
-        if row["case"] == case.name and row["method"] == "attack":
-            nominal, attacked = (e.mean() for e in pair(runs, case, row["point"], "training"))
+        if row["case"] == case.name:
+            nominal, attacked = (e.mean() for e in pair(runs, case, row["point"], VALIDATED))
             candidates[row["point"]] = (nominal > limit, attacked)
     return min(candidates, key=lambda name: candidates[name])
 
@@ -65,7 +66,8 @@ def write_report(stem: Path, cases: Sequence[Case], points: Rows, course: Rows, 
         "",
         f"{note}. Errors are means over a run in closed loop [m], then over held-out recordings, with the smallest and "
         "the largest recording in brackets; the attacker knows the weights. A point dominates when its attacked error "
-        f"is below the paper's by {1 - LOWER:.0%} or more, at no more than {ALLOWED - 1:.0%} more nominal error.",
+        f"is below the paper's by {1 - LOWER:.0%} or more, at no more than {ALLOWED - 1:.0%} more nominal error. The "
+        "chosen point is the one with the least attacked error within that limit on other, validation recordings.",
     ]
     for case in cases:
         lines += ["", *case_lines(case, points, runs)]
@@ -86,8 +88,8 @@ def case_lines(case: Case, points: Rows, runs: Rows) -> list[str]:
     order = list(METHODS)
     for row in sorted(mine, key=lambda row: (order.index(row["method"]), float(row["attacked_weight"]))):
         nominal, attacked = pair(runs, case, row["point"])
-        dominates = attacked.mean() < LOWER * paper[1].mean() and nominal.mean() <= allowed(runs, case, "held out")
-        name = METHODS[row["method"]] + (", **chosen on the training recordings**" if row["point"] == chosen else "")
+        dominates = attacked.mean() < LOWER * paper[1].mean() and nominal.mean() <= allowed(runs, case, HELD_OUT)
+        name = METHODS[row["method"]] + (", **chosen**" if row["point"] == chosen else "")
         cells = [name, f"{float(row['attacked_weight']):g}", row["evaluations"], f"{float(row['seconds']):.0f}"]
         cells += [f"{float(row['total']):.4f}" if float(row["attacked_weight"]) == 1 else ""]
         cells += [cell(nominal), cell(attacked), f"{attacked.mean() / paper[1].mean():.2f}"]
@@ -125,7 +127,7 @@ def other_attacks(case: Case, chosen: str, runs: Rows) -> list[str]:
     ]
     for attack in ("random", "algorithm1", "other"):
         for rho in case.rhos:
-            before, after = (errors(runs, case.name, p, "held out", attack, rho) for p in ("paper", chosen))
+            before, after = (errors(runs, case.name, p, HELD_OUT, attack, rho) for p in ("paper", chosen))
             ratio = f"{after.mean() / before.mean():.2f}"
             cells = [ATTACKS[attack], percent(rho), cell(before), cell(after), ratio]
             lines.append("| " + " | ".join(cells) + " |")
@@ -188,7 +190,7 @@ def draw_front(axes: Any, case: Case, points: Rows, runs: Rows) -> None:
     axes.set(title=case.title, ylabel=f"error under Algorithm 1 at {percent(case.rho)} [m]")
     if nominal > ZERO:
         spread_of = np.concatenate(list(means.values()))
-        shade(axes, allowed(runs, case, "held out"), attacked, spread_of)
+        shade(axes, allowed(runs, case, HELD_OUT), attacked, spread_of)
         axes.set_xlabel("error without attack [m]")
     else:  # one value for all: side by side
         for i, values in enumerate(means.values()):

@@ -9,7 +9,8 @@ from typing import Any, NamedTuple
 
 import torch
 
-from _tuning_cases import CASES, Weights
+from _case import Weights
+from _cases import CASES
 from torch_dpc import tuning
 
 STEPS, RATE = 60, 0.4  # of Adam

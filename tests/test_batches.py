@@ -109,3 +109,62 @@ def test_bad_batches_are_named(tmp_path):
         layer.compact_form(u_ini[0], y_ini[0])
     with pytest.raises(ValueError, match="cannot be saved"):
         layer.save(tmp_path / "layer.safetensors")
+
+
+def of_batch(*shape):
+    return torch.full(shape, 0.5, dtype=torch.float64)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"u_set": dpc.Box(-of_batch(3, 6, 2), of_batch(3, 6, 2))}, r"the samples \(2,\), lower \(3,\), upper \(3,\)"),
+        ({"u_set": dpc.Ball(of_batch(3, 6))}, r"the samples \(2,\), u_set \(3,\)"),
+        ({"lambda_g": of_batch(3)}, r"the samples \(2,\), lambda_g \(3,\)"),
+        ({"lambda_g": of_batch(3), "u_set": dpc.Ball(1.0)}, r"the samples \(2,\), lambda_g \(3,\)"),
+        ({"Q": torch.eye(4).expand(3, 4, 4)}, r"the samples \(2,\), Q \(3,\)"),
+        ({"data": dpc.HankelBatch(members())}, r"the samples \(2,\), data \(3,\)"),
+    ],
+)
+def test_samples_that_do_not_fit_a_batch_are_named(change, says):
+    layer = dpc.DPCLayer(**{"data": small_data(), **SMALL, **change})
+    with pytest.raises(ValueError, match="the batch shapes must broadcast, got " + says):
+        layer(*inputs(2))
+    assert layer(*inputs(3)).u.shape == (3, 6, 2)
+    repr(layer)
+
+
+@pytest.mark.parametrize(
+    ("change", "says"),
+    [
+        ({"Q": torch.eye(4).expand(2, 4, 4), "lambda_g": of_batch(3)}, r"Q \(2,\), lambda_g \(3,\)"),
+        ({"data": dpc.HankelBatch(members()), "lambda_u": of_batch(2)}, r"lambda_u \(2,\), data \(3,\)"),
+        ({"u_set": dpc.Ball(of_batch(3, 6)), "lambda_s": of_batch(2)}, r"lambda_s \(2,\), u_set \(3,\)"),
+        ({"u_set": dpc.Ball(of_batch(3, 6)), "y_set": dpc.Ball(of_batch(2, 6))}, r"u_set \(3,\), y_set \(2,\)"),
+        ({"u_set": dpc.Box(-of_batch(3, 6, 2), 1.0), "y_set": dpc.Box(-of_batch(2, 6, 4), 1.0)}, r"u_set .*y_set"),
+    ],
+)
+def test_batches_that_do_not_fit_each_other_are_told_at_construction(change, says):
+    with pytest.raises(ValueError, match="the batch shapes must broadcast, got " + says):
+        dpc.DPCLayer(**{"data": small_data(), **SMALL, **change})
+
+
+def test_data_sets_of_different_lengths_plan_but_have_no_one_g():
+    data = [small_data(), masses_data(1e-2, steps=120, t_ini=3, horizon=6), small_data(0.0)]
+    layer, (u_ini, y_ini) = dpc.DPCLayer(dpc.HankelBatch(data), **{**SMALL, "lambda_g": 0.0}), inputs()
+    plan = layer(u_ini, y_ini, y_ref=Y_REF)
+    alone = [dpc.DPCLayer(one, **{**SMALL, "lambda_g": 0.0}) for one in data]
+    plans = [one(u_ini[i], y_ini[i], y_ref=Y_REF) for i, one in enumerate(alone)]
+    assert plan.info.nonsingular.tolist() == [bool(one.info.nonsingular) for one in plans]
+    assert "reduced_kkt_size=36" in repr(layer) and "full_kkt_size" not in repr(layer)
+    with pytest.raises(ValueError, match="different numbers of windows, .112, 142.: there is no one g"):
+        plan.g  # noqa: B018
+    with pytest.raises(ValueError, match="there is no one g"):
+        layer.full_kkt_size  # noqa: B018
+
+
+@pytest.mark.parametrize("what", [None, 3, small_data(), [small_data(), None], []], ids=lambda w: type(w).__name__)
+def test_what_is_no_list_of_data_sets_is_named(what):
+    with pytest.raises(ValueError, match="`members` must be a list of one HankelData or more, got "):
+        dpc.HankelBatch(what)
+    assert len(dpc.HankelBatch(small_data() for _ in range(2)).members) == 2

@@ -221,6 +221,10 @@ SKEW = torch.eye(4) + torch.triu(torch.ones(4, 4), 1)
         ({"solver": "osqp"}, "`solver` must be one of .* got 'osqp'"),
         ({"backward": "none"}, "`backward` must be one of 'reduced', 'full', got 'none'"),
         ({"on_failure": None}, "`on_failure` must be one of"),
+        ({"R": [True, False]}, "`R` must be a number or a tensor, got .True, False."),
+        ({"lambda_g": torch.ones(0)}, r"`lambda_g` must hold .* got shape \(0,\)"),
+        ({"Q": torch.ones(0, 4, 4)}, r"`Q` must hold .* got shape \(0, 4, 4\)"),
+        ({"y_set": dpc.SoftBox(-1.0, 1.0, torch.ones(3))}, "`y_set` does not fit 4 channels over 6 steps"),
         ({"data": 3}, "`data` must be a HankelData or a HankelBatch, got int"),
     ],
     ids=lambda v: v[:40] if isinstance(v, str) else "",
@@ -246,3 +250,59 @@ def test_weights_spoilt_later_are_told_at_the_next_call():
     for grad in (True, False):
         with torch.set_grad_enabled(grad), pytest.raises(ValueError, match="`R` must be finite"):
             layer(u_ini, y_ini)
+
+
+@pytest.mark.parametrize(
+    ("changes", "says"),
+    [
+        ({"on_failure": "foo"}, "`on_failure` must be one of 'raise', 'nan', got 'foo'"),
+        ({"solver": "foo"}, "`solver` must be one of"),
+        ({"backward": "foo"}, "`backward` must be one of 'reduced', 'full', got 'foo'"),
+        ({"regularizer": "ridge"}, "`regularizer` must be one of"),
+        ({"terminal_steps": 7}, "`terminal_steps` must be an integer from 0 to the horizon, 6, got 7"),
+        ({"terminal_steps": 1.0}, "`terminal_steps` must be an integer from 0 to the horizon, got 1.0"),
+        ({"lambda_u": 1.0, "R_du": 1.0}, "which `lambda_u` leaves open"),
+        ({"lambda_u": -1.0}, "`lambda_u` must not be negative"),
+        ({"lambda_s": None}, "`lambda_s` must be a number or a tensor, got None"),
+        ({"u_set": (-1.0, 1.0)}, "`u_set` must be a ConvexSet or None, got tuple"),
+        ({"u_set": dpc.Box(torch.zeros(3), 1.0)}, r"bounds of `u_set` .*got \(3,\)"),
+        ({"solver": "newton", "u_set": dpc.Ball(1.0)}, "are for sets that are boxes"),
+        ({"u_set": dpc.Ball(1.0), "solver": "newton"}, "are for sets that are boxes"),
+        ({"backward": "full", "u_set": dpc.Ball(1.0)}, "are for sets that are boxes"),
+        ({"backward": "full", "lambda_u": 1.0}, 'backward="full" is the system of the paper'),
+        ({"data": 3}, "`data` must be a HankelData or a HankelBatch, got int"),
+        ({"Q": torch.eye(4), "data": delayed_layer().data}, "`u_ini` must have shape .* got"),
+        (
+            {"u_set": dpc.Box(-torch.ones(6, 2), 1.0), "data": masses_data(1e-2, steps=150, t_ini=3, horizon=8)},
+            r"bounds of `u_set` .* \(8, 2\) .*got \(6, 2\)",
+        ),
+    ],
+    ids=lambda v: v[:40] if isinstance(v, str) else "",
+)
+def test_settings_spoilt_later_are_told_at_the_next_call_at_the_latest(changes, says):
+    layer = small_layer()
+    layer(u_ini, y_ini)
+    with pytest.raises(ValueError, match=says):
+        for name, value in changes.items():
+            setattr(layer, name, value)
+        layer(u_ini, y_ini)
+    repr(layer)
+
+
+def test_parameters_of_sets_spoilt_later_are_told_at_the_next_call():
+    layer = small_layer()
+    layer(u_ini, y_ini)
+    layer.u_set.lower = torch.full((3,), -1.0)
+    with pytest.raises(ValueError, match=r"bounds of `u_set` .*got \(3,\)"):
+        layer(u_ini, y_ini)
+    layer = small_layer(u_set=dpc.Ball(1.0))
+    layer.u_set.radius = torch.ones(5)
+    with pytest.raises(ValueError, match="`u_set` does not fit 2 channels over 6 steps"):
+        layer(u_ini, y_ini)
+
+
+def test_a_setting_that_does_not_fit_may_be_on_the_way_to_one_that_does():
+    layer = small_layer(backward="full", solver="newton")
+    layer.u_set = dpc.Ball(0.3)
+    layer.backward, layer.solver = "reduced", "auto"
+    assert float(layer(u_ini, y_ini, y_ref=Y_REF).u.norm(dim=-1).amax()) == pytest.approx(0.3, abs=1e-9)

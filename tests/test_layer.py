@@ -9,7 +9,18 @@ import pytest
 import torch
 
 import torch_dpc as dpc
-from helpers import SMALL, Y_REF, delayed_layer, delayed_windows, randn, relative, small_data, small_layer, windows
+from helpers import (
+    SMALL,
+    Y_REF,
+    delayed_layer,
+    delayed_windows,
+    masses_data,
+    randn,
+    relative,
+    small_data,
+    small_layer,
+    windows,
+)
 
 SAME = 1e-10
 #: Single precision in and out: the last digit of the answer, through the rounding of the measurements.
@@ -210,6 +221,112 @@ def test_the_next_call_knows_what_changed(change, grad):
         fresh = dpc.DPCLayer(layer.data, **weights, u_set=layer.u_set)(u_ini, y_ini, y_ref=Y_REF).u
     assert relative(after, fresh) < SAME
     assert change == "the engine" or relative(after, before) > 1e-4
+
+
+#: What may be assigned after construction, beyond the weights and sets above.
+LATER = {
+    "R_du": 50.0,
+    "R_du learns": torch.nn.Parameter(50.0 * torch.eye(2, dtype=torch.float64)),
+    "lambda_u": 3.0,
+    "lambda_u learns": torch.nn.Parameter(torch.tensor(3.0, dtype=torch.float64)),
+    "du_set": dpc.Box(-0.3, 0.3),
+    "terminal_steps": np.int64(1),
+    "regularizer": "identity",
+    "u_set": dpc.Ball(0.1),
+    "u_set none": None,
+    "data of a longer horizon": masses_data(1e-2, steps=150, t_ini=3, horizon=8),
+}
+
+
+@pytest.mark.parametrize("change", LATER)
+@pytest.mark.parametrize("there_before", [False, True])
+def test_a_setting_assigned_later_is_that_of_a_layer_made_so(change, there_before):
+    """There and back again: each plan is that of a fresh layer with what `config()` says, sizes and copies agree."""
+    sets = {} if change == "terminal_steps" else {"u_set": dpc.Box(-0.4, 0.4)}
+    name, (u_ini, y_ini) = change.split(" ")[0], windows(2, 3, seed=1)
+    u_ini = 0.3 * u_ini
+    layer = dpc.DPCLayer(small_data(), **SMALL, **sets)
+    before = getattr(layer, name)
+    plain = layer(u_ini, y_ini, y_ref=Y_REF)
+    for value in (LATER[change], before) if there_before else (LATER[change],):
+        setattr(layer, name, value)
+        fresh = dpc.DPCLayer(layer.data, **layer.config())
+        ours, theirs = (each(u_ini, y_ini, y_ref=Y_REF) for each in (layer, fresh))
+        assert torch.equal(ours.u, theirs.u) and torch.equal(ours.lam, theirs.lam)
+        assert (layer.terms, layer.sizes) == (fresh.terms, fresh.sizes)
+        assert layer.reduced_kkt_size == fresh.reduced_kkt_size == ours.lam.shape[-1]
+        assert torch.equal(copy.deepcopy(layer)(u_ini, y_ini, y_ref=Y_REF).u, ours.u)
+        changed = ours.u.shape != plain.u.shape or relative(ours.u, plain.u) > 1e-4
+        assert changed == (value is not before)
+
+
+def test_a_plan_belongs_to_the_data_it_was_made_with():
+    layer, (u_ini, y_ini) = small_layer(), one()
+    plan, again = (layer(u_ini, y_ini, y_ref=Y_REF) for _ in range(2))
+    expected = again.g.clone()
+    layer.data = small_data(seed=4)
+    assert torch.equal(plan.g, expected)
+
+
+def test_the_bounds_are_those_of_the_present_horizon():
+    layer, (u_ini, y_ini) = small_layer(), one()
+    layer(u_ini, y_ini)
+    layer.data = masses_data(1e-2, steps=150, t_ini=3, horizon=8)
+    assert layer.bounds(torch.device("cpu"))[0].shape == (48,) and layer(u_ini, y_ini).u.shape == (8, 2)
+
+
+@pytest.mark.parametrize(
+    ("change", "most"),
+    [
+        (lambda s: s.factors.__setitem__(0, dpc.Box(-0.1, 0.1)), lambda u: u[..., 0].abs().amax()),
+        (lambda s: s.factors.__setitem__(1, dpc.Ball(0.1)), lambda u: u[..., 1].abs().amax()),
+        (lambda s: setattr(s.factors[1], "per", "trajectory"), lambda u: 0.2 * u[..., 1].norm(dim=-1).amax()),
+    ],
+    ids=["a box for a box", "a ball for a box", "a trajectory for a step"],
+)
+def test_what_changes_within_a_product_is_noticed(change, most):
+    product = dpc.Product([(dpc.Box(-0.5, 0.5), 0), (dpc.Ball(0.5), 1)])
+    layer, (u_ini, y_ini) = dpc.DPCLayer(small_data(), **SMALL, u_set=product), windows(2, 3, seed=1)
+    assert float(most(layer(u_ini, y_ini, y_ref=Y_REF).u)) > 0.1 + 1e-3
+    change(product)
+    assert float(most(layer(u_ini, y_ini, y_ref=Y_REF).u)) == pytest.approx(0.1, abs=1e-9)
+
+
+class Disc(dpc.Box):
+    """A box by its class, a ball by its projection."""
+
+    def __init__(self, radius):
+        super().__init__(-radius, radius)
+
+    def project(self, x):
+        return x * (self.upper / torch.linalg.vector_norm(x, dim=-1, keepdim=True)).clamp_max(1.0)
+
+
+def test_a_box_with_a_projection_of_its_own_is_what_it_projects_to():
+    u_ini, y_ini = windows(3, 3, seed=1)
+    plans, grads = [], []
+    for owner in (Disc(0.3), dpc.Ball(0.3)):
+        x = y_ini.clone().requires_grad_()
+        plans.append(dpc.DPCLayer(small_data(), **SMALL, u_set=owner)(u_ini, x, y_ref=Y_REF).u)
+        grads.append(torch.autograd.grad(plans[-1].sum(), x)[0])
+    assert relative(*plans) < SAME and relative(*grads) < SAME
+    assert float(plans[0].detach().norm(dim=-1).amax()) == pytest.approx(0.3, abs=1e-9)
+
+
+def test_a_parametrised_box_stays_a_box():
+    layer = small_layer(u_set=dpc.Box(-0.5, torch.nn.Parameter(torch.tensor(0.3, dtype=torch.float64))))
+    expected = layer(*one(), y_ref=Y_REF).u
+    torch.nn.utils.parametrize.register_parametrization(layer.u_set, "upper", Exponential())
+    assert layer.feasible_set.is_box and relative(layer(*one(), y_ref=Y_REF).u, expected) < SAME
+    assert small_layer(u_set=layer.u_set).feasible_set.is_box
+
+
+class Exponential(torch.nn.Module):
+    def forward(self, log):
+        return log.exp()
+
+    def right_inverse(self, value):
+        return value.log()
 
 
 def test_settings_changed_after_a_call_are_used():

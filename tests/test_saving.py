@@ -248,6 +248,61 @@ def test_what_cannot_be_written_is_named(tmp_path, registry):
         small_layer(u_set=Tube(dpc.Box(-1.0, 1.0), ["a", 1j])).save(tmp_path / "layer")
 
 
+@pytest.mark.parametrize("grad", [True, False])
+def test_of_what_is_parametrised_the_present_value_is_saved(tmp_path, grad):
+    number = lambda value: torch.nn.Parameter(torch.tensor(value, dtype=torch.float64))  # noqa: E731
+    layer = small_layer(lambda_g=number(3.0), u_set=dpc.Ball(number(0.4)), y_set=dpc.SoftBox(-9.0, number(9.0), 2.0))
+    for owner, name in ((layer, "lambda_g"), (layer.u_set, "radius"), (layer.y_set.box, "upper")):
+        torch.nn.utils.parametrize.register_parametrization(owner, name, Exponential())
+    with torch.set_grad_enabled(grad):
+        back = saved(layer, tmp_path)
+    assert type(back) is dpc.DPCLayer and type(back.u_set) is dpc.Ball and not list(back.parameters())
+    for found, wanted in ((back.lambda_g, 3.0), (back.u_set.radius, 0.4), (back.y_set.box.upper, 9.0)):
+        assert type(found) is torch.Tensor and not found.requires_grad
+        torch.testing.assert_close(float(found), wanted)
+    assert torch.equal(plan(back).u, plan(layer).u)
+
+
+class Exponential(torch.nn.Module):
+    def forward(self, log):
+        return log.exp()
+
+    def right_inverse(self, value):
+        return value.log()
+
+
+def test_a_parametrised_set_of_ones_own_is_named_by_its_class(tmp_path, registry):
+    layer = small_layer(u_set=Tube(dpc.Box(-1.0, 1.0), []))
+    layer.u_set.upper = torch.nn.Parameter(torch.tensor(0.5))
+    torch.nn.utils.parametrize.register_parametrization(layer.u_set, "upper", Exponential())
+    with pytest.raises(ValueError, match=r"register_set\(Tube\)"):
+        layer.save(tmp_path / "layer")
+
+
+@pytest.mark.parametrize("where", ["nowhere/layer", "."])
+def test_a_place_that_cannot_be_written_is_named(tmp_path, where):
+    with pytest.raises(OSError, match="cannot be written"):
+        small_layer().save(tmp_path / where)
+
+
+def test_settings_that_do_not_go_together_are_not_written(tmp_path):
+    layer = small_layer(solver="newton")
+    layer.u_set = dpc.Ball(1.0)
+    with pytest.raises(ValueError, match="sets that are boxes"):
+        layer.save(tmp_path / "layer")
+    assert not (tmp_path / "layer").exists()
+
+
+def test_counts_of_numpy_are_saved(tmp_path):
+    u, y = randn(60, 1), randn(60, 1, seed=1)
+    data = dpc.HankelData.from_trajectories(u, y, t_ini=np.int64(2), horizon=np.int32(4))
+    back = saved(dpc.DPCLayer(data, **SMALL, terminal_steps=np.int64(1)), tmp_path)
+    assert (back.data.t_ini, back.data.horizon, back.terminal_steps) == (2, 4, 1)
+    stream = dpc.HankelStream(t_ini=np.int64(2), horizon=np.int64(4))
+    stream.append(u, y)
+    assert saved(dpc.DPCLayer(stream.data, **SMALL), tmp_path).data.t_ini == 2
+
+
 # --- bad files --------------------------------------------------------------------------------------------------------
 
 

@@ -2,6 +2,7 @@
 
 import math
 
+import numpy as np
 import pytest
 import torch
 
@@ -125,6 +126,15 @@ def test_the_soft_box_is_the_proximal_map_of_its_price():
         (lambda: dpc.Product([(dpc.Ball(1.0), [0, 0])]), "every channel from 0 on once"),
         (lambda: dpc.Product([(1.0, [0])]), "pairs of a ConvexSet"),
         (lambda: dpc.Box(torch.tensor([1]), 2.0), "floating-point"),
+        (lambda: dpc.Box(0.0, True), "`upper` must be a number or an array of numbers, got True"),
+        (lambda: dpc.Box([False, True], 2.0), "`lower` must be a number or an array of numbers"),
+        (lambda: dpc.Ball(np.ones(3, dtype=bool)), "`radius` must be a number or an array of numbers"),
+        (lambda: dpc.Product(None), "`factors` must be pairs .* got None"),
+        (lambda: dpc.Product([dpc.Ball(1.0)]), "`factors` must be pairs .* got .Ball"),
+        (lambda: dpc.Product([(dpc.Ball(1.0), [0.0, 1.0])]), "a channel is an integer, got 0.0"),
+        (lambda: dpc.Product([(dpc.Ball(1.0), 0.0)]), "a channel is an integer, got 0.0"),
+        (lambda: dpc.Product([(dpc.Ball(1.0), False)]), "a channel is an integer, got False"),
+        (lambda: dpc.Product([(dpc.Ball(1.0), "x")]), "a channel is an integer, got 'x'"),
     ],
 )
 def test_bad_sets_are_named(make, says):
@@ -138,3 +148,25 @@ def test_a_box_of_a_trajectory_is_the_same_box():
     by_step = dpc.Box(lower, upper).project(x)
     whole = dpc.Box(lower, upper, per="trajectory").project(x.flatten())
     assert relative(whole.reshape(STEPS, CHANNELS), by_step) == 0
+
+
+def test_channels_may_be_any_integers():
+    ball = dpc.Ball(1.0)
+    product = dpc.Product([(ball, np.int64(0)), (ball, torch.tensor(3)), (ball, np.array([2, 1])), (ball, range(4, 5))])
+    assert product.channels == [[0], [3], [2, 1], [4]]
+    assert all(type(channel) is int for own in product.channels for channel in own)
+
+
+def test_what_follows_from_a_projection_follows_from_ones_own():
+    class Inner(dpc.Box):
+        def project(self, x):
+            return x * (self.upper / x.norm(dim=-1, keepdim=True)).clamp_max(1.0)
+
+    class Named(dpc.Box):
+        """Keeps the projection, and what belongs to it."""
+
+    x = randn(5, 3, seed=12) + 1.0
+    torch.testing.assert_close(Inner(-0.5, 0.5).jacobian(x), dpc.Ball(0.5).jacobian(x), rtol=0, atol=EXACT)
+    assert not Inner.separable and Named.separable and Named.jacobian is dpc.Box.jacobian
+    with pytest.raises(NotImplementedError):
+        Inner(-0.5, 0.5).minimize_linear(x)

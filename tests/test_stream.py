@@ -348,6 +348,7 @@ WITH_NAN[3, 1] = torch.nan
         ([(U, Y), (U[:5], Y[:6])], "item 1 .*as long, got 5 and 6"),
         ([(U, Y), (U[:, :1], Y)], "must have 2 and 3 channels, as before, got 1 and 3"),
         ([(U.long(), Y)], "`u.*floating.*int64"),
+        (5, "`chunks` must be an iterable of pairs .u, y., got int"),
         ([(U[None], Y[None])], r"`u` must have shape \(T, n\)"),
     ],
 )

@@ -15,8 +15,9 @@ sys.path.insert(0, str(SCRIPTS))
 import _tuning_report as report  # noqa: E402
 import figure3_masses  # noqa: E402
 import tune_regularization as script  # noqa: E402
+from _case import Weights  # noqa: E402
+from _cases import CASES, MovingTarget  # noqa: E402
 from _tables import Table, as_they_finish  # noqa: E402
-from _tuning_cases import CASES, MovingTarget, Weights  # noqa: E402
 from torch_dpc import tuning  # noqa: E402
 
 
@@ -49,7 +50,7 @@ def test_only_what_is_missing_is_run_again():
     assert len(rows) == len(set(rows))  # no run twice
     assert script.missing(jobs, set(rows)) == []
     left = script.missing(jobs, set(rows) - {rows[0]})
-    assert [(j[0], j[1], j[2], list(j[3])) for j in left] == [("held", "held out", 0, ["paper"])]
+    assert [(j[0], j[1], j[2], list(j[3])) for j in left] == [("held", jobs[0][1], jobs[0][2], ["paper"])]
 
 
 def test_the_masses_run_as_in_figure_3():
@@ -91,7 +92,7 @@ def test_weights_survive_the_table(tmp_path):
 
 
 def test_the_choice_respects_the_nominal_limit():
-    def run(point, attack, error, split="training"):
+    def run(point, attack, error, split=report.VALIDATED):
         keys = {"case": "moving", "point": point, "split": split, "seed": "100", "attack": attack}
         return {**keys, "rho": "0" if attack == "nominal" else "0.1", "error": str(error)}
 
@@ -109,7 +110,7 @@ def test_a_short_run_leaves_its_files_and_is_not_repeated(tmp_path, monkeypatch)
     arguments = ["--plants", "masses", "--quick", "--workers", "1", "--out", str(tmp_path)]
     script.main(arguments)
     text = (tmp_path / "tuning_masses_quick.md").read_text()
-    assert text.count("chosen on the training recordings") == 2 and "Optuna, TPE" in text
+    assert text.count("**chosen**") == 2 and "Optuna, TPE" in text
     assert (tmp_path / "tuning_masses_quick.png").stat().st_size > 10_000
     before = {path.name: path.read_bytes() for path in tmp_path.glob("*.csv")}
     script.main(arguments)

@@ -264,6 +264,8 @@ def test_bad_windows_are_named():
     layer = small_layer()
     with pytest.raises(ValueError, match=r"`windows` must hold u_ini and y_ini of shape \(B, t_ini, n\)"):
         tuning.RobustObjective(layer, tuning.Windows(torch.zeros(3, 2), torch.zeros(3, 4), torch.zeros(4)), BUDGET)
+    with pytest.raises(ValueError, match="`data` must be one HankelData, got list"):
+        tuning.DataPredictor([])
     with pytest.raises(ValueError, match="at least one"):
         tuning.tune([])
     batched = dpc.DPCLayer(small_data(), Q=10.0, R=1.0, lambda_g=torch.tensor([1.0, 2.0]), lambda_s=1e3)

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import math
+import operator
+from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
@@ -45,10 +47,32 @@ def is_finite(tensor: Tensor) -> bool:
     return math.isfinite(float(tensor.detach().sum())) or bool(torch.isfinite(tensor.detach()).all())
 
 
-def check_count(name: str, value: Any) -> None:
-    """Raise ValueError unless the value is a positive integer."""
-    if not isinstance(value, int) or isinstance(value, bool) or value < 1:
-        raise ValueError(f"`{name}` must be a positive integer, got {value!r}.")
+def as_index(rule: str, value: Any) -> int:
+    """Return an integer, NumPy's and torch's included; anything else, booleans too, breaks `rule`, as the error says.
+
+    Raises:
+        ValueError: no integer.
+    """
+    is_bool = isinstance(value, (bool, np.bool_)) or getattr(value, "dtype", None) is torch.bool
+    try:
+        if not is_bool:
+            return operator.index(value)
+    except TypeError:
+        pass
+    raise ValueError(f"{rule}, got {value!r}.")
+
+
+def check_count(name: str, value: Any) -> int:
+    """Return a positive integer, NumPy's and torch's included.
+
+    Raises:
+        ValueError: anything else.
+    """
+    rule = f"`{name}` must be a positive integer"
+    count = as_index(rule, value)
+    if count < 1:
+        raise ValueError(f"{rule}, got {value!r}.")
+    return count
 
 
 def window(name: str, value: Any, steps: int, channels: int, symbol: str) -> Tensor:
@@ -81,10 +105,22 @@ def with_one_batch(parts: list[Tensor]) -> list[Tensor]:
     shapes = [part.shape[:-2] for part in parts]
     if all(shape == shapes[0] for shape in shapes):
         return parts
-    try:
-        batch = torch.broadcast_shapes(*shapes)
-    except RuntimeError as error:
-        names = ("u_ini", "y_ini", "u_ref", "y_ref")
-        came = ", ".join(f"{name} {tuple(shape)}" for name, shape in zip(names, shapes, strict=True))
-        raise ValueError(f"the batch shapes must broadcast, got {came}.") from error
+    batch = one_batch(zip(("u_ini", "y_ini", "u_ref", "y_ref"), shapes, strict=True))
     return [part.expand(*batch, *part.shape[-2:]) for part in parts]
+
+
+def one_batch(named: Iterable[tuple[str, torch.Size]]) -> torch.Size:
+    """Return the batch shape that all broadcast to, each given with its name.
+
+    Raises:
+        ValueError: they do not; it names those that have a batch dimension.
+    """
+    batched = [(name, shape) for name, shape in named if len(shape)]
+    shapes = {shape for _, shape in batched}
+    if len(shapes) < 2:  # `broadcast_shapes` takes 20 us
+        return shapes.pop() if shapes else torch.Size(())
+    try:
+        return torch.broadcast_shapes(*shapes)
+    except RuntimeError as error:
+        came = ", ".join(f"{name} {tuple(shape)}" for name, shape in batched)
+        raise ValueError(f"the batch shapes must broadcast, got {came}.") from error

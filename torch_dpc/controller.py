@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .checks import as_index
 from .errors import Status
 from .layer import DPCLayer
 from .soften import plan_softened
@@ -50,10 +51,10 @@ class DPCController:
         horizon = layer.data.horizon
         if replan_every is None:
             replan_every = min(10, horizon)
-        if not isinstance(replan_every, int) or isinstance(replan_every, bool) or not 1 <= replan_every <= horizon:
-            raise ValueError(
-                f"`replan_every` must be an integer from 1 to the horizon, {horizon}, got {replan_every!r}."
-            )
+        rule = f"`replan_every` must be an integer from 1 to the horizon, {horizon}"
+        replan_every = as_index(rule, replan_every)
+        if not 1 <= replan_every <= horizon:
+            raise ValueError(f"{rule}, got {replan_every!r}.")
         if on_failure not in ("raise", "hold", "soften"):
             raise ValueError(f'`on_failure` must be "raise", "hold" or "soften", got {on_failure!r}.')
         if on_failure == "soften" and not layer.feasible_set.is_box:

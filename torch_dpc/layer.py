@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 import functools
 import os
 from typing import Any
@@ -9,7 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from .checks import reference, window, with_one_batch
+from .checks import one_batch, reference, window, with_one_batch
 from .data.hankel import HankelData
 from .data.hankel_batch import HankelBatch
 from .errors import Status
@@ -21,8 +22,9 @@ from .problem.reduction import Reduction, reduce
 from .problem.rows import DataRows, Terms
 from .problem.weights import Weights, penalty, weight_matrix
 from .saving import load_layer, save_layer
-from .sets import ConvexSet, Reals
+from .sets import ConvexSet
 from .sets.feasible import FeasibleSet
+from .settings import DOORS, Setup, check_choice, settings_of
 from .solution import DPCSolution, SolveInfo
 from .solve.convex_solve import ConvexSolver
 from .solve.solver import Planned, Solver
@@ -97,39 +99,57 @@ class DPCLayer(nn.Module):
         on_failure: str = "raise",
     ):
         super().__init__()
-        _check_choice("backward", backward, ("reduced", "full"))
-        _check_choice("solver", solver, ("auto", "newton", "daqp"))
-        _check_choice("on_failure", on_failure, ("raise", "nan"))
-        if not isinstance(data, (HankelData, HankelBatch)):
-            raise ValueError(f"`data` must be a HankelData or a HankelBatch, got {type(data).__name__}.")
-        _check_choice("regularizer", regularizer, ("projection", "identity"))
+        self._setup_cache: tuple[tuple[Any, ...], Setup] | None = None
+        self._cache: dict[tuple[str, torch.device], tuple[tuple[Any, ...], Any]] = {}
         self.data = data
         self.Q, self.R, self.lambda_g, self.lambda_s = Q, R, lambda_g, lambda_s
         self.lambda_u, self.R_du = lambda_u, R_du
-        self.u_set: ConvexSet = _as_set("u_set", Reals() if u_set is None else u_set)
-        self.y_set: ConvexSet = _as_set("y_set", Reals() if y_set is None else y_set)
-        self.du_set: ConvexSet | None = None if du_set is None else _as_set("du_set", du_set)
+        self.u_set: ConvexSet = u_set  # type: ignore[assignment]
+        self.y_set: ConvexSet = y_set  # type: ignore[assignment]
+        self.du_set: ConvexSet | None = du_set
         self.regularizer = regularizer
-        self.terminal_steps = _checked_steps(terminal_steps, data.horizon)
-        self.terms = Terms(
-            identity=regularizer == "identity",
-            slack=lambda_u is not None,
-            rates=R_du is not None or du_set is not None,
-            terminal_steps=self.terminal_steps,
-        )
-        if self.terms.slack and self.terms.rates:
-            raise ValueError("`R_du` and `du_set` count from the last u_ini, which `lambda_u` leaves open: give one.")
+        self.terminal_steps = terminal_steps
         self.backward_system = backward
         self.solver = solver
         self.on_failure = on_failure
-        self.sizes = Sizes.of(data, self.terms)
-        self._cache: dict[tuple[str, torch.device], tuple[tuple[Any, ...], Any]] = {}
-        self._sets: tuple[tuple[Any, ...], FeasibleSet] | None = None
-        if not self.feasible_set.is_box and (backward == "full" or solver != "auto"):
-            raise ValueError('`backward="full"` and the choice of a `solver` are for sets that are boxes.')
-        self._weights(torch.device("cpu"))  # bad weights and bounds are told now, not at the first call
-        if self.feasible_set.is_box:
-            self.feasible_set.bounds(torch.device("cpu"))
+        cpu = torch.device("cpu")
+        weights = self._weights(cpu)  # bad weights and bounds are told now, not at the first call
+        if self._setup.is_box:
+            self.bounds(cpu)
+        one_batch([*self._batches_of(weights), *self.feasible_set.batches(cpu)])
+
+    def __setattr__(self, name: str, value: Any) -> None:
+        """Assign; a setting is checked first, as the constructor checks it."""
+        door = DOORS.get(name)
+        super().__setattr__(name, value if door is None else door(name, value))
+
+    @property
+    def _setup(self) -> Setup:
+        """What follows from the settings, made anew when one of them has changed."""
+        now = settings_of(self.__dict__)
+        kept = self._setup_cache
+        if kept is None or kept[0] != now:
+            kept = self._setup_cache = (now, Setup.of(self))
+        return kept[1]
+
+    @property
+    def backward(self) -> str:
+        """The system that the backward solves, "reduced" or "full"; may be assigned."""
+        return self.backward_system
+
+    @backward.setter
+    def backward(self, value: str) -> None:
+        self.backward_system = value
+
+    @property
+    def terms(self) -> Terms:
+        """Which terms the problem has beyond the paper's."""
+        return self._setup.terms
+
+    @property
+    def sizes(self) -> Sizes:
+        """The sizes of the parts of theta and of v."""
+        return self._setup.sizes
 
     @property
     def reduction(self) -> Reduction:
@@ -139,15 +159,7 @@ class DPCLayer(nn.Module):
     @property
     def feasible_set(self) -> FeasibleSet:
         """All sets of the problem as one."""
-        owners = (self.u_set, self.y_set, self.du_set)
-        if self._sets is None or any(now is not then for now, then in zip(owners, self._sets[0], strict=True)):
-            data = self.data
-            sets = [("u_set", self.u_set, data.n_u), ("y_set", self.y_set, data.n_y)]
-            if self.terms.rates:
-                sets.append(("du_set", Reals() if self.du_set is None else self.du_set, data.n_u))
-            stacked = FeasibleSet.of((name, owner, data.horizon, n) for name, owner, n in sets)
-            self._sets = (owners, stacked)
-        return self._sets[1]
+        return self._setup.sets
 
     @property
     def reduced_kkt_size(self) -> int:
@@ -156,7 +168,11 @@ class DPCLayer(nn.Module):
 
     @property
     def full_kkt_size(self) -> int:
-        """Unknowns of the paper's system: 2 horizon (n_u + n_y) + t_ini n_u + n_g."""
+        """Unknowns of the paper's system: 2 horizon (n_u + n_y) + t_ini n_u + n_g.
+
+        Raises:
+            ValueError: the data sets of a batch have different n_g.
+        """
         data = self.data
         return 2 * data.horizon * (data.n_u + data.n_y) + data.t_ini * data.n_u + data.n_g
 
@@ -185,9 +201,11 @@ class DPCLayer(nn.Module):
 
     def _call(self, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any, on_failure: str | None) -> DPCSolution:
         theta, dtype = self.flatten(u_ini, y_ini, y_ref, u_ref)
-        if self.feasible_set.is_box:
+        if self._setup.is_box:
             return self.plan(theta, *self.bounds(theta.device), dtype=dtype, on_failure=on_failure)
         reduction, solver = self._factors(theta.device)
+        batches = [("the samples", theta.shape[:-1]), *self._batches_of(reduction.weights)]
+        one_batch([*batches, *self.feasible_set.batches(theta.device)])
         planned = _with_failures(solver, on_failure).plan(theta, reduction)
         return self._solution(planned, theta, reduction, solver, dtype)
 
@@ -209,6 +227,9 @@ class DPCLayer(nn.Module):
             on_failure: in place of the layer's own.
         """
         reduction, solver = self._factors(theta.device)
+        if lower.ndim > 1 or upper.ndim > 1 or reduction.V.ndim > 2:
+            bounds = [("lower", lower.shape[:-1]), ("upper", upper.shape[:-1])]
+            one_batch([("the samples", theta.shape[:-1]), *self._batches_of(reduction.weights), *bounds])
         planned = solve_reduced(_with_failures(solver, on_failure), theta, reduction, lower, upper)
         return self._solution(planned, theta, reduction, solver, dtype)
 
@@ -216,12 +237,13 @@ class DPCLayer(nn.Module):
         self, planned: Planned, theta: Tensor, reduction: Reduction, solver: Any, dtype: torch.dtype
     ) -> DPCSolution:
         u, y, lam, _, info = planned
+        data = self.data  # g is made later, and is of these
         return DPCSolution(
             u=u if dtype == torch.float64 else u.to(dtype),
             y=y if dtype == torch.float64 else y.to(dtype),
-            info=SolveInfo(info, reduction.is_selection, lambda: self._nonsingular(solver, theta, planned)),
+            info=SolveInfo(info, reduction.is_selection, lambda: _nonsingular(data, solver, theta, planned)),
             lam=lam,
-            _make_g=lambda: self._g(reduction, theta, lam, info).to(dtype),
+            _make_g=lambda: _g(data, reduction, theta, lam, info).to(dtype),
         )
 
     def compact_form(self, u_ini: Any, y_ini: Any, *, y_ref: Any = None, u_ref: Any = None) -> CompactForm:
@@ -260,6 +282,8 @@ class DPCLayer(nn.Module):
         """Write the layer to a safetensors file: weights, sets, settings and the data, without pickle.
 
         Parameters, tensors and numbers come back as what they are; of a tensor that a graph made, its value is kept.
+        So it is with what `torch.nn.utils.parametrize` makes: the present value comes back, a plain tensor, without
+        its parametrisation.
 
         Args:
             path: of the file, which is replaced.
@@ -267,7 +291,9 @@ class DPCLayer(nn.Module):
                 whatever the number of windows, plans are the same, and `sol.g` raises.
 
         Raises:
-            ValueError: a set that is not known (:func:`torch_dpc.register_set`); windows asked of compact data.
+            ValueError: a set that is not known (:func:`torch_dpc.register_set`); windows asked of compact data;
+                settings that do not go together.
+            OSError: the file cannot be written.
             ImportError: safetensors is missing.
         """
         save_layer(self, path, data=data)
@@ -285,8 +311,13 @@ class DPCLayer(nn.Module):
 
     def extra_repr(self) -> str:
         """Describe the data and the sizes of the systems that are solved."""
+        sizes = ""
+        for name in ("reduced_kkt_size", "full_kkt_size"):
+            # Settings under change may not fit, and the data sets of a batch may differ: neither has a size to show.
+            with contextlib.suppress(ValueError):
+                sizes += f", {name}={getattr(self, name)}"
         return (
-            f"{self.data!r}, reduced_kkt_size={self.reduced_kkt_size}, full_kkt_size={self.full_kkt_size}, "
+            f"{self.data!r}{sizes}, "
             f"backward={self.backward_system!r}, solver={self.solver!r}, on_failure={self.on_failure!r}"
         )
 
@@ -311,7 +342,7 @@ class DPCLayer(nn.Module):
     def _weights(self, device: torch.device) -> Weights:
         """Return the weights as float64 tensors of the whole horizon, with their graph."""
         data = self.data
-        return Weights(
+        weights = Weights(
             Q=weight_matrix("Q", self.Q, data.n_y, data.horizon).to(device),
             R=weight_matrix("R", self.R, data.n_u, data.horizon).to(device),
             lambda_g=penalty("lambda_g", self.lambda_g).to(device),
@@ -319,15 +350,23 @@ class DPCLayer(nn.Module):
             lambda_u=None if self.lambda_u is None else penalty("lambda_u", self.lambda_u).to(device),
             R_du=None if self.R_du is None else weight_matrix("R_du", self.R_du, data.n_u, data.horizon).to(device),
         )
+        one_batch(self._batches_of(weights))
+        return weights
+
+    def _batches_of(self, weights: Weights) -> list[tuple[str, torch.Size]]:
+        """Return the batch dimensions of the weights and of the data, by name."""
+        batches = [(name, x.shape[: x.ndim - weights.TAILS[name]]) for name, x in weights.tensors.items()]
+        if isinstance(self.data, HankelBatch):
+            batches.append(("data", torch.Size([len(self.data.members)])))
+        return batches
 
     def _factors(self, device: torch.device) -> tuple[Reduction, Any]:
         """Return the reduced problem and its solver; with a graph, which must not outlive the call, made each time."""
         weights = (self.Q, self.R, self.lambda_g, self.lambda_s, self.lambda_u, self.R_du)
         if is_fleeting((*weights, *self.data.matrices)):
             return self._factor(device)
-        settings = (self.solver, self.on_failure, self.backward_system)
         # The matrices of the data are constants of a frozen object: the object stands for them.
-        return self._cached(("factors", device), (*weights, *settings, self.data), self._factor, device)
+        return self._cached(("factors", device), (*weights, self._setup.of_factors), self._factor, device)
 
     def bounds(self, device: torch.device) -> tuple[Tensor, Tensor]:
         """Return the bounds of (u, y, du) flattened, `(N,)` or `(*batch, N)` each, float64, with their graph.
@@ -335,13 +374,14 @@ class DPCLayer(nn.Module):
         Raises:
             ValueError: a set is no box.
         """
-        sets = self.feasible_set
-        if not sets.is_box:
+        setup = self._setup
+        sets = setup.sets
+        if not setup.is_box:
             raise ValueError("the sets of this layer are not all boxes: they have no bounds.")
         sources = tuple(bound for owner, _ in sets.parts for bound in (owner.lower, owner.upper))
         if is_fleeting(sources):
             return sets.bounds(device)
-        return self._cached(("bounds", device), sources, sets.bounds, device)
+        return self._cached(("bounds", device), (*sources, sets), sets.bounds, device)
 
     def _cached(self, key: tuple[str, torch.device], sources: tuple[Any, ...], make: Any, *args: Any) -> Any:
         """Return what `make` makes of the sources, made anew when their values have changed."""
@@ -356,13 +396,14 @@ class DPCLayer(nn.Module):
         """Return the rows of the data; weights that learn leave them alone."""
         if is_fleeting(self.data.matrices):
             return _rows_of(self.data, device, self.terms)
-        return self._cached(("rows", device), (self.data,), _rows_of, self.data, device, self.terms)
+        terms = self.terms
+        return self._cached(("rows", device), (self.data, terms), _rows_of, self.data, device, terms)
 
     def _factor(self, device: torch.device) -> tuple[Reduction, Solver | ConvexSolver]:
         reduction = reduce(self._rows(device), self._weights(device))
-        detached = reduction.detach()
-        if not self.feasible_set.is_box:
-            return reduction, ConvexSolver(detached, self.sizes, self.feasible_set, self.on_failure)
+        detached, setup = reduction.detach(), self._setup
+        if not setup.is_box:
+            return reduction, ConvexSolver(detached, setup.sizes, setup.sets, self.on_failure)
         full = None
         if self.backward_system == "full":
             if reduction.V.requires_grad or reduction.V.ndim > 2:
@@ -370,32 +411,34 @@ class DPCLayer(nn.Module):
                     'backward="full" differentiates with respect to measurements and references of one problem; '
                     'use backward="reduced" for weights or data that learn, or have a batch dimension.'
                 )
-            if self.terms != Terms():
+            if setup.terms != Terms():
                 raise ValueError('backward="full" is the system of the paper\'s problem; use backward="reduced".')
             assert isinstance(self.data, HankelData)  # batches were refused with the batched reductions
             full = FullSystem(self.data, detached.weights)
-        return reduction, Solver(detached, self.sizes, self.solver, self.on_failure, full)
+        return reduction, Solver(detached, setup.sizes, self.solver, self.on_failure, full)
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the factors out of copies and pickles: they are made again when needed."""
-        return {**self.__dict__, "_cache": {}, "_sets": None}
+        return {**self.__dict__, "_cache": {}, "_setup_cache": None}
 
-    def _nonsingular(self, solver: Any, theta: Tensor, planned: Planned) -> Tensor:
-        reduction, data = solver.reduction, self.data
-        # The part of g that the data do not see is fixed by lambda_g alone.
-        fixed = (reduction.weights.lambda_g > 0) | (torch.as_tensor(data.rank) == data.n_g)
-        decided = reduction.rows.Eq_range is None and not reduction.is_selection
-        with torch.no_grad():
-            return solver.independent(theta.detach(), planned) & fixed & decided
 
-    def _g(self, reduction: Reduction, theta: Tensor, lam: Tensor, info: Tensor) -> Tensor:
-        self.data.require_windows()
-        a = times(reduction.A_theta, theta) - times(reduction.A_lam, lam)
-        g = times(basis := self.data.basis.to(a.device), a)
-        if reduction.rows.C.requires_grad:  # g = D^+ (D g), so that the data behind D are differentiated too
-            D = self.data.stacked.to(a.device)
-            g = times(torch.linalg.pinv(D, rtol=1e-10), times(D @ basis, a))
-        return torch.where(info[..., :1] == Status.SOLVED, g, torch.nan)
+def _nonsingular(data: HankelData | HankelBatch, solver: Any, theta: Tensor, planned: Planned) -> Tensor:
+    reduction = solver.reduction
+    # The part of g that the data do not see is fixed by lambda_g alone.
+    fixed = (reduction.weights.lambda_g > 0) | data.spans_all.to(theta.device)
+    decided = reduction.rows.Eq_range is None and not reduction.is_selection
+    with torch.no_grad():
+        return solver.independent(theta.detach(), planned) & fixed & decided
+
+
+def _g(data: HankelData | HankelBatch, reduction: Reduction, theta: Tensor, lam: Tensor, info: Tensor) -> Tensor:
+    data.require_windows()
+    a = times(reduction.A_theta, theta) - times(reduction.A_lam, lam)
+    g = times(basis := data.basis.to(a.device), a)
+    if reduction.rows.C.requires_grad:  # g = D^+ (D g), so that the data behind D are differentiated too
+        D = data.stacked.to(a.device)
+        g = times(torch.linalg.pinv(D, rtol=1e-10), times(D @ basis, a))
+    return torch.where(info[..., :1] == Status.SOLVED, g, torch.nan)
 
 
 def _rows_of(data: HankelData | HankelBatch, device: torch.device, terms: Terms) -> DataRows:
@@ -410,27 +453,10 @@ def _uncompiled() -> Any:
     return torch.compiler.disable(DPCLayer._call)
 
 
-def _check_choice(name: str, value: str, choices: tuple[str, ...]) -> None:
-    if value not in choices:
-        raise ValueError(f"`{name}` must be one of {', '.join(map(repr, choices))}, got {value!r}.")
-
-
-def _as_set(name: str, value: Any) -> ConvexSet:
-    if not isinstance(value, ConvexSet):
-        raise ValueError(f"`{name}` must be a ConvexSet or None, got {type(value).__name__}.")
-    return value
-
-
-def _checked_steps(steps: Any, horizon: int) -> int:
-    if not isinstance(steps, int) or isinstance(steps, bool) or not 0 <= steps <= horizon:
-        raise ValueError(f"`terminal_steps` must be an integer from 0 to the horizon, {horizon}, got {steps!r}.")
-    return steps
-
-
 def _with_failures(solver: Any, on_failure: str | None) -> Any:
     if on_failure is None or on_failure == solver.on_failure:
         return solver
-    _check_choice("on_failure", on_failure, ("raise", "nan"))
+    check_choice("on_failure", on_failure)
     return solver.with_failures(on_failure)
 
 
@@ -442,4 +468,5 @@ def _is_same(kept: Any, now: Any) -> bool:
         if kept.device != now.device:
             kept = kept.to(now.device)
         return kept.dtype == now.dtype and torch.equal(kept, now)
-    return kept is now or (isinstance(kept, (int, float, str)) and isinstance(now, (int, float, str)) and kept == now)
+    plain = (int, float, str, tuple, Terms)
+    return isinstance(kept, plain) and isinstance(now, plain) and kept == now

@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 from torch import Tensor, nn
+from torch.nn.utils import parametrize
 
 from .data.hankel import HankelData
 from .data.rowspace import RowSpace
@@ -36,6 +37,7 @@ def save_layer(layer: nn.Module, path: str | os.PathLike[str], *, data: bool = F
     """Write a layer; see :meth:`torch_dpc.DPCLayer.save`."""
     torch_files = _safetensors()
     writer = _Writer()
+    layer.feasible_set  # noqa: B018  # settings that do not go together could not be loaded
     held = layer.data
     if not isinstance(held, HankelData):
         raise ValueError("a layer on a batch of data sets cannot be saved: save one layer for each.")
@@ -46,7 +48,12 @@ def save_layer(layer: nn.Module, path: str | os.PathLike[str], *, data: bool = F
         "data": _data_to_tree(held if data else held.compressed(), writer),
         "arguments": {name: writer.tree(value, f"`{name}`", name) for name, value in arguments_of(layer).items()},
     }
-    torch_files.save_file(writer.tensors, path, metadata={HEADER: json.dumps(text, allow_nan=False)})
+    from safetensors import SafetensorError
+
+    try:
+        torch_files.save_file(writer.tensors, path, metadata={HEADER: json.dumps(text, allow_nan=False)})
+    except SafetensorError as error:
+        raise OSError(f"{os.fspath(path)!r} cannot be written: {error}") from error
 
 
 def load_layer(cls: type[Any], path: str | os.PathLike[str]) -> Any:
@@ -129,8 +136,10 @@ class _Writer:
         if isinstance(value, (list, tuple)):
             return [self.tree(item, f"{what}[{i}]", f"{key}.{i}") for i, item in enumerate(value)]
         if isinstance(value, ConvexSet):
-            name = type(value).__name__
-            if known_sets().get(name) is not type(value):
+            # A parametrised set is of a class that was made for it alone; its attributes are their present values.
+            cls = parametrize.type_before_parametrizations(value)
+            name = cls.__name__
+            if known_sets().get(name) is not cls:
                 raise ValueError(
                     f"{what} is a {name}, which saved layers do not know: call torch_dpc.register_set({name}) first, "
                     f"here and where the layer is loaded."

@@ -125,7 +125,7 @@ def simulate(
         y_ref: reference, `(n_y,)` or a trajectory `(>= steps, n_y)` whose last row is held beyond its end.
         steps: steps under control.
         u_ref: input reference, `(n_u,)` or a trajectory, likewise; zero by default.
-        attack: (u_ini, y_ini, *, y_ref, u_ref, generator, step) -> p, shape of y_ini.
+        attack: `(u_ini, y_ini, *, y_ref, u_ref, generator, step)` -> p, shape of y_ini.
         generator: handed to the attack.
         reset: whether to reset the plant, or the arguments of its reset. A plant that is not reset and has no
             `measure()` makes one more step at `u_warmup`, to learn its present output.

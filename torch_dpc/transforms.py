@@ -33,8 +33,8 @@ def is_mapped(value: Any) -> bool:
 def refuse_forward_twice() -> None:
     """Raise NotImplementedError within a forward derivative of a forward derivative.
 
-    Within the `jvp` of a Function torch keeps no other tangent: what the `jvp` itself depends on is lost, without a word.
-    Where it depends on nothing, as at boxes with constant weights, this does not matter.
+    Within the `jvp` of a Function torch keeps no other tangent: what the `jvp` itself depends on is lost without a
+    word. Where it depends on nothing, as at boxes with constant weights, this does not matter.
     """
     if _functorch is None:
         return

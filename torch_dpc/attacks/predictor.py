@@ -29,7 +29,9 @@ class Predictor:
         tensor([1.0000, 2.0000, 3.0000])
     """
 
-    def __init__(self, data: HankelData):
+    def __init__(self, data: Any):
+        if not isinstance(data, HankelData):
+            raise ValueError(f"`data` must be one HankelData, got {type(data).__name__}.")
         self.t_ini, self.horizon, self.n_u, self.n_y = data.t_ini, data.horizon, data.n_u, data.n_y
         space = data.row_space
         with torch.inference_mode(False), torch.no_grad():

@@ -78,8 +78,7 @@ class HankelData:
         Warns:
             ExcitationWarning: the input is not persistently exciting of order t_ini + horizon.
         """
-        check_count("t_ini", t_ini)
-        check_count("horizon", horizon)
+        t_ini, horizon = check_count("t_ini", t_ini), check_count("horizon", horizon)
         u_list, y_list = as_recordings(u, y)
         depth = t_ini + horizon
         for i, recording in enumerate(u_list):
@@ -138,6 +137,11 @@ class HankelData:
     def n_g(self) -> int:
         """The columns of the matrices: the number of windows, unless the data are compact."""
         return self.Up.shape[-1]
+
+    @property
+    def spans_all(self) -> Tensor:
+        """Whether the rows of the data span all of g, boolean: then no part of g is left to lambda_g alone."""
+        return torch.tensor(self.rank == self.n_g)
 
     @property
     def has_windows(self) -> bool:

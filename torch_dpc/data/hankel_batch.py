@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable
 
 import torch
 from torch import Tensor
@@ -33,10 +33,13 @@ class HankelBatch:
         torch.Size([2, 5, 1])
     """
 
-    def __init__(self, members: Sequence[HankelData]):
+    def __init__(self, members: Iterable[HankelData]):
+        if not isinstance(members, Iterable):
+            raise ValueError(f"`members` must be a list of one HankelData or more, got {type(members).__name__}.")
         self.members = tuple(members)
         if not self.members or not all(isinstance(data, HankelData) for data in self.members):
-            raise ValueError("`members` must be one HankelData or more.")
+            came = ", ".join(type(data).__name__ for data in self.members) or "none"
+            raise ValueError(f"`members` must be a list of one HankelData or more, got {came}.")
         sizes = {(data.t_ini, data.horizon, data.n_u, data.n_y) for data in self.members}
         if len(sizes) > 1:
             raise ValueError(f"the data sets must be alike in (t_ini, horizon, n_u, n_y), got {sorted(sizes)}.")
@@ -70,13 +73,28 @@ class HankelBatch:
         return torch.tensor([data.rank for data in self.members])
 
     @property
+    def spans_all(self) -> Tensor:
+        """Of each data set, whether its rows span all of its g, boolean `(members,)`."""
+        return torch.stack([data.spans_all for data in self.members])
+
+    @property
     def stacked(self) -> Tensor:
-        """The matrices [Up; Yp; Uf; Yf], `(members, rows, n_g)`, float64; a graph is kept."""
+        """The matrices [Up; Yp; Uf; Yf], `(members, rows, n_g)`, float64; a graph is kept.
+
+        Raises:
+            ValueError: they have different numbers of columns.
+        """
+        self.n_g  # noqa: B018  # it says so
         return torch.stack([data.stacked for data in self.members])
 
     @property
     def basis(self) -> Tensor:
-        """B of g = B a for each data set, padded with zero columns: `(members, n_g, r)`."""
+        """B of g = B a for each data set, padded with zero columns: `(members, n_g, r)`.
+
+        Raises:
+            ValueError: they have different numbers of columns.
+        """
+        self.n_g  # noqa: B018  # it says so
         most = int(self.rank.max())
         return torch.stack([torch.nn.functional.pad(data.basis, (0, most - data.rank)) for data in self.members])
 

@@ -64,8 +64,7 @@ class HankelStream:
     """
 
     def __init__(self, *, t_ini: int, horizon: int, forgetting: float = 1.0):
-        check_count("t_ini", t_ini)
-        check_count("horizon", horizon)
+        t_ini, horizon = check_count("t_ini", t_ini), check_count("horizon", horizon)
         if isinstance(forgetting, bool) or not isinstance(forgetting, (int, float)) or not 0 < forgetting <= 1:
             raise ValueError(f"`forgetting` must be a number in (0, 1], got {forgetting!r}.")
         self.t_ini, self.horizon, self.forgetting = t_ini, horizon, float(forgetting)
@@ -132,6 +131,8 @@ class HankelStream:
 
     def extend(self, chunks: Iterable[Any]) -> None:
         """Append every pair (u, y) of an iterable; None starts a new recording."""
+        if not isinstance(chunks, Iterable):
+            raise ValueError(f"`chunks` must be an iterable of pairs (u, y), got {type(chunks).__name__}.")
         for i, chunk in enumerate(chunks):
             if chunk is None:
                 self.new_recording()

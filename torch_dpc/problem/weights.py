@@ -109,8 +109,6 @@ def as_weight(name: str, value: Any) -> Tensor:
             f"vmap over weights is not supported: give `{name}` a leading batch dimension, of which the "
             "layer makes one batched factorisation."
         )
-    if isinstance(value, bool):
-        raise ValueError(f"`{name}` must be a number or a tensor, got {value!r}.")
     if isinstance(value, Tensor):
         if not value.is_floating_point():
             raise ValueError(f"`{name}` must hold floating-point numbers, got {value.dtype}.")
@@ -118,8 +116,13 @@ def as_weight(name: str, value: Any) -> Tensor:
     else:
         try:
             tensor = torch.as_tensor(value, dtype=torch.float64)
+            is_bool = torch.as_tensor(value).dtype == torch.bool
         except (TypeError, ValueError, RuntimeError) as error:
             raise ValueError(f"`{name}` must be a number or a tensor, got {value!r}.") from error
+        if is_bool:
+            raise ValueError(f"`{name}` must be a number or a tensor, got {value!r}.")
+    if tensor.numel() == 0:
+        raise ValueError(f"`{name}` must hold one problem's weight or more, got shape {tuple(tensor.shape)}.")
     if not bool(torch.isfinite(tensor.detach()).all()):
         raise ValueError(f"`{name}` must be finite, got {tensor.detach().tolist()}.")
     return tensor

@@ -17,6 +17,20 @@ from torch import Tensor, nn
 Part = tuple["ConvexSet", Tensor]
 
 
+#: What a set has by definition of its projection, unless it says otherwise.
+_FOLLOWING = (
+    "separable",
+    "jacobian",
+    "jacobian_diagonal",
+    "jacobian_product",
+    "minimize_linear",
+    "support",
+    "bounded_direction",
+    "slack",
+    "is_point",
+)
+
+
 class ConvexSet(nn.Module):
     """A closed convex set of the channels of one step, or of a whole trajectory.
 
@@ -39,6 +53,14 @@ class ConvexSet(nn.Module):
 
     #: Whether the projection acts on every entry alone, so that its Jacobian is diagonal.
     separable = False
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        """Have what follows from a projection follow from the subclass's own, not from that of the class above it."""
+        super().__init_subclass__(**options)
+        if "project" in vars(cls) or "prox" in vars(cls):
+            for name in _FOLLOWING:
+                if name not in vars(cls):
+                    setattr(cls, name, vars(ConvexSet)[name])
 
     def __init__(self, per: str = "step"):
         super().__init__()
@@ -107,15 +129,14 @@ class ConvexSet(nn.Module):
         """
         for owner, places in self.parts(steps, channels):
             x = torch.zeros(places.shape, dtype=torch.float64)
+            fits = f"`{name}` does not fit {channels} channels over {steps} steps"
             try:
-                shape = owner.project(x).shape
-            except (RuntimeError, ValueError) as error:
-                raise ValueError(f"`{name}` does not fit {channels} channels over {steps} steps: {error}") from error
-            if shape[-2:] != x.shape:
-                raise ValueError(
-                    f"`{name}` does not fit {channels} channels over {steps} steps: it projects {tuple(x.shape)} to "
-                    f"{tuple(shape)}."
-                )
+                shapes = [owner.project(x).shape, owner.prox(x, x.new_ones(*x.shape[:-1], 1)).shape]
+            except (RuntimeError, ValueError, TypeError, IndexError) as error:
+                raise ValueError(f"{fits}: {error}") from error
+            for shape in shapes:
+                if shape[-2:] != x.shape:
+                    raise ValueError(f"{fits}: it projects {tuple(x.shape)} to {tuple(shape)}.")
 
     def check_values(self) -> None:
         """Raise ValueError where the parameters, as they are now, do not describe a set."""

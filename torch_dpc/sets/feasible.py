@@ -5,14 +5,16 @@ from __future__ import annotations
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
-from typing import cast
+from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
+from ..checks import one_batch
 from ..transforms import is_mapped, is_plain
 from .base import ConvexSet, Part
 from .box import Box, SoftBox
+from .product import Product
 
 #: The Jacobian of the projection, part by part: its diagonal `(..., groups, size)` where the set is separable, blocks
 #: `(..., groups, size, size)` otherwise.
@@ -27,9 +29,11 @@ class FeasibleSet:
 
     Attributes:
         parts: every set with the rows it holds for, `(groups, size)`.
+        names: what each part belongs to, "u_set" and the like, for messages.
     """
 
     parts: list[Part]
+    names: list[str]
 
     @staticmethod
     def of(sets: Iterable[tuple[str, ConvexSet, int, int]]) -> FeasibleSet:
@@ -39,12 +43,14 @@ class FeasibleSet:
             ValueError: a set does not fit.
         """
         parts: list[Part] = []
+        names: list[str] = []
         start = 0
         for name, owner, steps, channels in sets:
             owner.check(name, steps, channels)
             parts += [(leaf, start + places) for leaf, places in owner.parts(steps, channels)]
+            names += [name] * (len(parts) - len(names))
             start += steps * channels
-        return FeasibleSet(parts)
+        return FeasibleSet(parts, names)
 
     def versions(self) -> list[int]:
         """Return torch's count of the changes in place of every parameter of the sets."""
@@ -53,7 +59,7 @@ class FeasibleSet:
 
     def snapshot(self) -> FeasibleSet:
         """Return the same sets with the parameters that they have now."""
-        return FeasibleSet([(cast(ConvexSet, _snapshot(owner)), places) for owner, places in self.parts])
+        return FeasibleSet([(cast(ConvexSet, _snapshot(owner)), places) for owner, places in self.parts], self.names)
 
     @cached_property
     def order(self) -> Tensor:
@@ -83,25 +89,49 @@ class FeasibleSet:
         """The batch dimensions that the sets' own parameters have."""
         return self.prox(torch.zeros(len(self.order), dtype=torch.float64)).shape[:-1]
 
+    def batches(self, device: torch.device) -> list[tuple[str, torch.Size]]:
+        """Return the batch dimensions that the parameters of each part have, by name.
+
+        Raises:
+            ValueError: a parameter of another shape was assigned since the sets were checked.
+        """
+        found = []
+        for (owner, places), name in zip(self.parts, self.names, strict=True):
+            try:
+                moved = owner.prox(torch.zeros(places.shape, dtype=torch.float64, device=device), 1.0)
+            except RuntimeError:
+                owner.check(name, *places.shape)
+                raise
+            found.append((name, moved.shape[:-2]))
+        return found
+
     @property
     def is_box(self) -> bool:
         """Whether all sets together are a box."""
-        return all(isinstance(owner, Box) for owner, _ in self.parts)
+        return all(_is_box(owner) for owner, _ in self.parts)
 
     @property
     def is_piecewise_affine(self) -> bool:
         """Whether the projection certainly is: its Jacobian then has no derivative."""
-        return all(isinstance(owner, (Box, SoftBox)) for owner, _ in self.parts)
+        return all(_is_box(owner) or type(owner) is SoftBox for owner, _ in self.parts)
 
     def bounds(self, device: torch.device) -> tuple[Tensor, Tensor]:
         """Return lower and upper of v where the sets are a box, `(..., N)` each, float64, with their graph."""
         like = torch.empty(0, dtype=torch.float64, device=device)
         sides: tuple[list[Tensor], list[Tensor]] = ([], [])
-        for owner, places in self.parts:
+        shapes: list[tuple[str, torch.Size]] = []
+        for (owner, places), name in zip(self.parts, self.names, strict=True):
             assert isinstance(owner, Box)
             owner.check_bounds()
             for side, value in zip(sides, owner.bounds(like), strict=True):
-                side.append(_flat(torch.broadcast_to(value, (*value.shape[:-2], *places.shape))))
+                try:
+                    full = torch.broadcast_to(value, (*value.shape[:-2], *places.shape))
+                except RuntimeError:  # a bound of another shape, assigned since the set was checked
+                    owner.check(name, *places.shape)
+                    raise
+                shapes.append((name, value.shape[:-2]))
+                side.append(_flat(full))
+        one_batch(shapes)
         inverse = self.inverse.to(device)
         return _joined(sides[0])[..., inverse], _joined(sides[1])[..., inverse]
 
@@ -256,6 +286,21 @@ class FeasibleSet:
     @staticmethod
     def _group(x: Tensor, at: slice, shape: tuple[int, ...]) -> Tensor:
         return x[..., at].reshape(*x.shape[:-1], *shape)
+
+
+def outline(owner: ConvexSet) -> Any:
+    """Return what the parts of a set hang on, to compare by `==`: the sets within, their `per` and their channels."""
+    held = owner.__dict__
+    if not held["_modules"]:
+        return owner, held.get("per")
+    channels = [list(own) for own in owner.channels] if isinstance(owner, Product) else None
+    return owner, held.get("per"), channels, [outline(inner) for inner in owner.children()]  # type: ignore[arg-type]
+
+
+def _is_box(owner: ConvexSet) -> bool:
+    """Return whether the bounds of a set are all of it: a Box whose projection no subclass replaces."""
+    cls = type(owner)
+    return isinstance(owner, Box) and cls.project is Box.project and cls.prox is Box.prox
 
 
 def _snapshot(module: nn.Module) -> nn.Module:

@@ -19,8 +19,11 @@ def as_bound(name: str, value: Any) -> Tensor | float:
         return value
     try:
         tensor = torch.as_tensor(value, dtype=torch.float64)
+        is_bool = torch.as_tensor(value).dtype == torch.bool
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"`{name}` must be a number or an array of numbers, got {value!r}.") from error
+    if is_bool:
+        raise ValueError(f"`{name}` must be a number or an array of numbers, got {value!r}.")
     return tensor.item() if tensor.ndim == 0 else tensor
 
 

@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from typing import Any, cast
 
 import torch
 from torch import Tensor, nn
 
+from ..checks import as_index
 from .base import ConvexSet, Part
 
 
@@ -24,12 +25,10 @@ class Product(ConvexSet):
     """
 
     def __init__(self, factors: Sequence[tuple[ConvexSet, int | Sequence[int]]]):
-        pairs = [(owner, [channels] if isinstance(channels, int) else list(channels)) for owner, channels in factors]
+        pairs = _pairs_of(factors)
         named = [channel for _, channels in pairs for channel in channels]
         if sorted(named) != list(range(len(named))) or not named:
             raise ValueError(f"`factors` must name every channel from 0 on once, got {sorted(named)}.")
-        if not all(isinstance(owner, ConvexSet) for owner, _ in pairs):
-            raise ValueError("`factors` must be pairs of a ConvexSet and its channels.")
         whole = any(owner.per == "trajectory" for owner, _ in pairs)
         super().__init__("trajectory" if whole else "step")
         self.factors = nn.ModuleList(owner for owner, _ in pairs)
@@ -69,3 +68,20 @@ class Product(ConvexSet):
 
     def config(self) -> dict[str, Any]:
         return {"factors": list(zip(self.factors, self.channels, strict=True))}
+
+
+def _pairs_of(factors: Any) -> list[tuple[ConvexSet, list[int]]]:
+    """Return the factors as pairs of a set and the list of its channels."""
+    rule = "`factors` must be pairs of a ConvexSet and its channels, a number or a list of them"
+    try:
+        given = [(owner, channels) for owner, channels in factors]
+    except (TypeError, ValueError) as error:
+        raise ValueError(f"{rule}, got {factors!r}.") from error
+    pairs = []
+    for owner, channels in given:
+        if not isinstance(owner, ConvexSet):
+            raise ValueError(f"{rule}, got {type(owner).__name__} for a set.")
+        several = isinstance(channels, Iterable) and getattr(channels, "ndim", 1) > 0
+        each = [as_index(f"{rule}; a channel is an integer", c) for c in (channels if several else [channels])]
+        pairs.append((owner, each))
+    return pairs

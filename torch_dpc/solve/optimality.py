@@ -31,8 +31,9 @@ WEAKLY_ACTIVE = 1e-9
 #: rounding of R (u - u_ref) and Q (y - y_ref): this fraction of |C| |(R, Q)| (|v| + |v_ref|) counts as a term too.
 CANCELLATION = 1e-3
 #: 2 lambda_s Yp'Yp a cannot be evaluated to better than a few units in the last place of lambda_s |Yp|^2 |a|; relative
-#: to the accepted residual, 1e-8, that is this fraction. The same holds for G lam in v.
-ROUNDING = 1e-6
+#: to the accepted residual, 1e-8, that is this fraction. The same holds for G lam in v, up to a few times |v|:
+#: multipliers that run away, because there is no solution, must not cover for a v outside its set.
+ROUNDING, MOST_DISPLACED = 1e-6, 10.0
 
 
 @dataclass(frozen=True)
@@ -156,7 +157,9 @@ class Optimality:
         size_a = norm(a) + norm(a0)  # a is their difference: where it vanishes, what is left is their rounding
         # z - Proj_D(z - P z - q - H'w), the rows of u and y; u = Uf g and y = Yf g hold because v is C a
         size_v = norm(v)
-        in_set = norm(v - projected) / (size_v + norm(v0) + self._size_G * norm(lam) + _TINY)
+        displaced = self._size_G * norm(lam)
+        displaced = displaced * MOST_DISPLACED * size_v / (displaced + MOST_DISPLACED * size_v + _TINY)  # below both
+        in_set = norm(v - projected) / (size_v + norm(v0) + displaced + _TINY)
         # Up g = u_ini, and what else is held
         wanted = theta[..., self._Eq_theta]
         held = norm(_times(self._Eq, a) - wanted) / (norm(wanted) + self._size_Eq * size_a + _TINY)

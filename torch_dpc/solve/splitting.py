@@ -38,8 +38,8 @@ GOOD = 1e-10
 PENALTY, LARGEST_PENALTY, GROWTH, ROUNDS = 1.0, 1e9, 10.0, 60
 #: Newton steps on one augmented Lagrangian, the slope at which it is solved, and bisections of a line search.
 INNER_STEPS, FLAT, BISECTIONS = 40, 1e-12, 40
-#: What rounding leaves of a slope at least, relative to its terms; near it (the second number is how near), steps that do
-#: not halve the slope any more (the third is how many) have found as much as there is.
+#: What rounding leaves of a slope at least, relative to its terms; near it (the second number is how near), steps that
+#: do not halve the slope any more (the third is how many) have found as much as there is.
 ROUNDING, FEW_ULPS, STALLED = 1e-16, 100.0, 3
 #: Newton steps up to which the penalty may grow.
 EASY = 20
@@ -194,7 +194,7 @@ def _minimise(Ct: Tensor, shift: Tensor, sets: FeasibleSet, reach: Tensor, x: Te
     gradient, w = slope(x)
     steps = torch.zeros(x.shape[:-1], dtype=torch.int64, device=x.device)
     norm = torch.linalg.vector_norm
-    eye = torch.eye(Ct.shape[-1], dtype=Ct.dtype, device=Ct.device)
+    may_leave = x.ndim == 2 and not sets.batch_shape
     size = left = norm(gradient, dim=-1)
     rounding, stalled = ROUNDING * torch.linalg.matrix_norm(Ct), torch.zeros_like(steps)
     for _ in range(INNER_STEPS):
@@ -205,9 +205,11 @@ def _minimise(Ct: Tensor, shift: Tensor, sets: FeasibleSet, reach: Tensor, x: Te
         todo = (now > floor) & ((stalled < STALLED) | (now > FEW_ULPS * floor))
         if not bool(todo.any()):
             break
-        curved = sets.complement_times(sets.jacobians(w, reach), Ct) / reach[..., None]
-        L, _ = torch.linalg.cholesky_ex(eye + Ct.mT @ curved)
-        step = -torch.cholesky_solve(gradient[..., None], L)[..., 0] * todo[..., None]
+        some = todo.nonzero()[:, 0] if may_leave else slice(None)
+        scale, C = (part if part.ndim == own else part[some] for part, own in ((reach, 1), (Ct, 2)))
+        step = torch.zeros_like(x)
+        step[some] = _newton_step(C, w[some], gradient[some], sets, scale)
+        step = step * todo[..., None]
         steps = steps + todo
         # The slope along the step grows from below zero: the minimum is where it vanishes, and 1 is tried first.
         low, high = torch.zeros_like(steps, dtype=x.dtype), torch.ones_like(steps, dtype=x.dtype)
@@ -223,3 +225,12 @@ def _minimise(Ct: Tensor, shift: Tensor, sets: FeasibleSet, reach: Tensor, x: Te
             length = torch.where(too_far | too_short, (low + high) / 2, length)
         x, gradient, w = trial, gradient_trial, w_trial
     return x, steps
+
+
+def _newton_step(Ct: Tensor, w: Tensor, gradient: Tensor, sets: FeasibleSet, reach: Tensor) -> Tensor:
+    """Return -(I + Ct' (I - D) Ct / reach)^-1 gradient."""
+    curved = sets.complement_times(sets.jacobians(w, reach), Ct) / reach[..., None]
+    rows = curved.abs().amax(-1).reshape(-1, curved.shape[-2]).amax(0).nonzero()[:, 0]  # few rows meet their bounds
+    eye = torch.eye(Ct.shape[-1], dtype=Ct.dtype, device=Ct.device)
+    L, _ = torch.linalg.cholesky_ex(eye + Ct[..., rows, :].mT @ curved[..., rows, :])
+    return -torch.cholesky_solve(gradient[..., None], L)[..., 0]

@@ -5,10 +5,9 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-import torch
 from torch import Tensor
 
-from ..data.hankel import HankelData
+from ..attacks.predictor import Predictor as SubspacePredictor
 
 #: What inputs do from a window on: (u_ini, y_ini, u) -> y, all `(*batch, steps, n)`.
 Predictor = Callable[[Tensor, Tensor, Tensor], Tensor]
@@ -16,36 +15,16 @@ Predictor = Callable[[Tensor, Tensor, Tensor], Tensor]
 RunCost = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
 
 
-class DataPredictor:
-    """Predict from recorded data, y = Yf W^+ [u_ini; y_ini; u], W = [Up; Yp; Uf]: exact where the data are.
-
-    The data had better not be those of the layer: a layer with a large lambda_g plans with this very predictor, and
-    would be judged by its own opinion.
-
-    Example:
-        >>> from torch_dpc import HankelData, collect, systems
-        >>> u, y = collect(systems.OscillatingMasses(), 120, generator=torch.Generator().manual_seed(0))
-        >>> predict = DataPredictor(HankelData.from_trajectories(u, y, t_ini=4, horizon=10))
-        >>> bool((predict(u[:4], y[:4], u[4:14]) - y[4:14]).abs().max() < 1e-9)
-        True
-    """
-
-    def __init__(self, data: HankelData):
-        basis = data.row_space.basis[:, : data.row_space.rank_W]
-        Up, Yp, Uf, Yf = (m.detach().double() @ basis for m in data.matrices)
-        self.matrix = Yf @ torch.linalg.pinv(torch.cat([Up, Yp, Uf]))
-        self.n_y = data.n_y
-
-    def __call__(self, u_ini: Tensor, y_ini: Tensor, u: Tensor) -> Tensor:
-        """Return y `(*batch, horizon, n_y)`; u is `(*batch, horizon, n_u)`."""
-        known = torch.cat([u_ini.flatten(-2), y_ini.flatten(-2), u.flatten(-2)], dim=-1)
-        return (known @ self.matrix.mT).unflatten(-1, (-1, self.n_y))
+#: What recorded data predict. They had better not be those of the layer: a layer with a large lambda_g plans with this
+#: very predictor, and would be judged by its own opinion.
+DataPredictor = SubspacePredictor
 
 
 class MeanError:
     """The mean over the steps of |(y - y_ref)[channels]|, in the units of the outputs.
 
     Example:
+        >>> import torch
         >>> y = torch.tensor([[3.0, 4.0, 9.0], [0.0, 0.0, 9.0]])
         >>> MeanError([0, 1])(None, y, None, torch.zeros(2, 3))
         tensor(2.5000)
