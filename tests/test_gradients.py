@@ -370,3 +370,40 @@ def test_a_first_call_within_a_transform_leaves_a_sound_layer(road, u_set):
     assert relative(hessian(loss(layer))(y_ini), hessian(loss(used))(y_ini)) < EXACT
     y = y_ini.clone().requires_grad_()
     assert relative(torch.autograd.grad(loss(layer)(y), y)[0], grad(loss(used))(y_ini)) < EXACT
+
+
+@pytest.mark.parametrize("u_set", [dpc.Box(-0.5, 0.5), dpc.Ball(0.5)], ids=["box", "ball"])
+@pytest.mark.parametrize("name", ["lambda_g", "bound", "data"])
+def test_an_outer_derivative_is_seen_from_within_an_inner_one(name, u_set):
+    """The slope of a gradient in y_ini, as a weight, a bound or the data change: each has a transform of its own."""
+    u_ini, y_ini = (w[0] for w in windows(1, 3, seed=1, scale=0.5))
+    u, y = dpc.collect(dpc.systems.OscillatingMasses(noise=0.02, generator=torch.Generator().manual_seed(5)), 90)
+    direction, way = randn(3, 4, seed=9), randn(*y.shape, seed=10)
+    curved = isinstance(u_set, dpc.Ball)
+
+    def loss(x, y_ini):
+        if name == "lambda_g":
+            layer = small_layer(lambda_g=2 * x, u_set=u_set)
+        elif name == "bound":
+            layer = small_layer(u_set=dpc.Ball(x) if curved else dpc.Box(-0.5, x))
+        else:
+            data = dpc.HankelData.from_trajectories(u, y + 0.1 * x * way, t_ini=3, horizon=6)
+            layer = dpc.DPCLayer(data, 10.0, 1.0, 1.0, 1e3, u_set=u_set)
+        return (layer(u_ini, y_ini, y_ref=Y_REF).u ** 3).sum()
+
+    def by_grad(x):
+        return (grad(lambda y: loss(x, y))(y_ini) * direction).sum()
+
+    def by_jvp(x):
+        return jvp(lambda y: loss(x, y), (y_ini,), (direction,))[1]
+
+    at = torch.tensor(0.5, dtype=torch.float64)
+    expected = central(by_grad, at)
+    assert expected.abs() > 1e-3
+    for inner in (by_grad, by_jvp):
+        assert relative(grad(inner)(at), expected) < 1e-5, inner.__name__
+    if name != "data":
+        assert relative(jacfwd(by_grad)(at), expected) < 1e-5
+    if name == "lambda_g" or (name == "bound" and curved):
+        with pytest.raises(NotImplementedError, match="forward derivatives of forward derivatives"):
+            jacfwd(by_jvp)(at)

@@ -28,7 +28,7 @@ from .settings import DOORS, Setup, check_choice, settings_of
 from .solution import DPCSolution, SolveInfo
 from .solve.convex_solve import ConvexSolver
 from .solve.solver import Planned, Solver
-from .transforms import is_fleeting, untransformed
+from .transforms import carries_derivative, untransformed
 
 
 class DPCLayer(nn.Module):
@@ -363,7 +363,7 @@ class DPCLayer(nn.Module):
     def _factors(self, device: torch.device) -> tuple[Reduction, Any]:
         """Return the reduced problem and its solver; with a graph, which must not outlive the call, made each time."""
         weights = (self.Q, self.R, self.lambda_g, self.lambda_s, self.lambda_u, self.R_du)
-        if is_fleeting((*weights, *self.data.matrices)):
+        if carries_derivative((*weights, *self.data.matrices)):
             return self._factor(device)
         # The matrices of the data are constants of a frozen object: the object stands for them.
         return self._cached(("factors", device), (*weights, self._setup.of_factors), self._factor, device)
@@ -379,7 +379,7 @@ class DPCLayer(nn.Module):
         if not setup.is_box:
             raise ValueError("the sets of this layer are not all boxes: they have no bounds.")
         sources = tuple(bound for owner, _ in sets.parts for bound in (owner.lower, owner.upper))
-        if is_fleeting(sources):
+        if carries_derivative(sources):
             return sets.bounds(device)
         return self._cached(("bounds", device), (*sources, sets), sets.bounds, device)
 
@@ -394,7 +394,7 @@ class DPCLayer(nn.Module):
 
     def _rows(self, device: torch.device) -> DataRows:
         """Return the rows of the data; weights that learn leave them alone."""
-        if is_fleeting(self.data.matrices):
+        if carries_derivative(self.data.matrices):
             return _rows_of(self.data, device, self.terms)
         terms = self.terms
         return self._cached(("rows", device), (self.data, terms), _rows_of, self.data, device, terms)
@@ -406,7 +406,7 @@ class DPCLayer(nn.Module):
             return reduction, ConvexSolver(detached, setup.sizes, setup.sets, self.on_failure)
         full = None
         if self.backward_system == "full":
-            if reduction.V.requires_grad or reduction.V.ndim > 2:
+            if carries_derivative((reduction.V,)) or reduction.V.ndim > 2:
                 raise ValueError(
                     'backward="full" differentiates with respect to measurements and references of one problem; '
                     'use backward="reduced" for weights or data that learn, or have a batch dimension.'
@@ -435,7 +435,7 @@ def _g(data: HankelData | HankelBatch, reduction: Reduction, theta: Tensor, lam:
     data.require_windows()
     a = times(reduction.A_theta, theta) - times(reduction.A_lam, lam)
     g = times(basis := data.basis.to(a.device), a)
-    if reduction.rows.C.requires_grad:  # g = D^+ (D g), so that the data behind D are differentiated too
+    if carries_derivative((reduction.rows.C,)):  # g = D^+ (D g), so that the data behind D are differentiated too
         D = data.stacked.to(a.device)
         g = times(torch.linalg.pinv(D, rtol=1e-10), times(D @ basis, a))
     return torch.where(info[..., :1] == Status.SOLVED, g, torch.nan)

@@ -65,13 +65,6 @@ def is_grads_batched(tensor: Tensor) -> bool:
     return _is_legacy_batched(tensor)
 
 
-def is_fleeting(values: tuple[Any, ...]) -> bool:
-    """Return whether what is made of these values must not outlive the call: they have a derivative or a wrapper."""
-    if _are_transforms_active() and not all(is_plain(value) for value in values if isinstance(value, Tensor)):
-        return True
-    return carries_derivative(values)
-
-
 def untransformed() -> contextlib.AbstractContextManager[Any]:
     """Return a context without transforms, for what outlives the call; there every tensor must be plain.
 
@@ -91,11 +84,15 @@ def constant(tensor: Tensor) -> Tensor:
 
 
 def carries_derivative(values: tuple[Any, ...]) -> bool:
-    """Return whether a derivative, backward or forward, may be asked of one of the tensors among values."""
-    if torch.is_grad_enabled():
-        for value in values:
-            if isinstance(value, Tensor) and value.requires_grad:
-                return True
+    """Return whether a derivative, backward or forward, may be asked of one of the tensors among values.
+
+    What a transform has wrapped counts: a derivative that an outer one asks for is not seen from within an inner one.
+    """
+    tensors = [value for value in values if isinstance(value, Tensor)]
+    if _are_transforms_active() and not all(map(is_plain, tensors)):
+        return True
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
+        return True
     if getattr(forward_ad, "_current_level", 0) < 0:  # no forward derivative is under way: spare the look at each
         return False
-    return any(forward_ad.unpack_dual(v).tangent is not None for v in values if isinstance(v, Tensor))
+    return any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)

@@ -228,7 +228,7 @@ def _gram_of_charged(rows: DataRows) -> Tensor:
     N = _charged(rows)
     M = N.mT @ N
     W = torch.cat([rows.Up, rows.Yp, rows.Uf], dim=-2)
-    if not W.requires_grad or rows.is_identity:
+    if not carries_derivative((W,)) or rows.is_identity:
         return M
     with torch.no_grad():
         W_pinv = torch.linalg.pinv(W, rtol=1e-10)

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from ..linear import lead_all
-from ..transforms import constant, refuse_forward_twice
+from ..transforms import carries_derivative, constant, refuse_forward_twice
 
 
 @dataclass(frozen=True, eq=False)
@@ -46,7 +46,7 @@ def known_solution(Psi: Tensor, Eq: Tensor, top: Tensor, bottom: Tensor, a: Tens
     """Return the solution `a`, computed elsewhere to full precision, with the derivative of the solve attached."""
     refuse_forward_twice()
     # mu is seen by the cotangent of Eq alone, and costs as much as the rest.
-    mu = saddle.multipliers(constant(Psi), constant(top), a) if Eq.requires_grad else torch.zeros_like(bottom)
+    mu = saddle.multipliers(constant(Psi), constant(top), a) if carries_derivative((Eq,)) else torch.zeros_like(bottom)
     solved, _ = _SaddleSolve.apply(Psi, Eq, top, bottom, a, mu, saddle.T, saddle.Z, saddle.Eq_pinv)
     return solved
 
@@ -71,7 +71,8 @@ class _SaddleSolve(torch.autograd.Function):
         Psi, Eq, a, mu, *factors = ctx.saved_tensors
         saddle = Saddle(*factors)
         a_bar, mu_bar = cotangents
-        moves = ctx.needs_input_grad[1] or ctx.needs_input_grad[3]
+        # A derivative in Eq that an outer transform asks for is not among those needed here.
+        moves = ctx.needs_input_grad[1] or ctx.needs_input_grad[3] or carries_derivative((Eq,))
         with torch.no_grad():
             s = saddle.solve(Psi, a_bar, mu_bar)
             t = saddle.multipliers(Psi, a_bar, s) if moves else torch.zeros_like(mu_bar)
