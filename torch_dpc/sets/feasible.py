@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, cast
@@ -54,8 +54,20 @@ class FeasibleSet:
 
     def versions(self) -> list[int]:
         """Return torch's count of the changes in place of every parameter of the sets."""
-        tensors = (x for owner, _ in self.parts for x in _tensors_of(owner))
-        return [x._version for x in tensors if is_plain(x.data if isinstance(x, nn.Parameter) else x)]
+        return [x._version for x in self.tensors if is_plain(x.data if isinstance(x, nn.Parameter) else x)]
+
+    @property
+    def tensors(self) -> list[Tensor]:
+        """The tensors that the sets hold."""
+        return [holder[name] for owner, _ in self.parts for holder, name in _places_of(owner)]
+
+    def with_tensors(self, tensors: Iterable[Tensor]) -> FeasibleSet:
+        """Return a snapshot with these in place of `tensors`."""
+        copy = self.snapshot()
+        places = [place for owner, _ in copy.parts for place in _places_of(owner)]
+        for (holder, name), tensor in zip(places, tensors, strict=True):
+            holder[name] = tensor
+        return copy
 
     def snapshot(self) -> FeasibleSet:
         """Return the same sets with the parameters that they have now."""
@@ -189,7 +201,7 @@ class FeasibleSet:
         Raises:
             NotImplementedError: `vmap` maps one of them.
         """
-        if any(is_mapped(x) for owner, _ in self.parts for x in _tensors_of(owner)):
+        if any(map(is_mapped, self.tensors)):
             raise NotImplementedError(
                 "vmap over the parameters of a set is for layers whose sets are all boxes: give the parameters (a "
                 "radius, a bound, ...) a leading batch dimension, which is solved as one batch."
@@ -318,11 +330,10 @@ def _flat(x: Tensor) -> Tensor:
     return x.reshape(*x.shape[:-2], x.shape[-2] * x.shape[-1])
 
 
-def _tensors_of(module: nn.Module) -> Iterator[Tensor]:
-    """Yield the tensors that a module and its children hold, as parameters, buffers or attributes."""
-    for part in module.modules():
-        for holder in (part._parameters, part._buffers, part.__dict__):
-            yield from (x for x in holder.values() if isinstance(x, Tensor))
+def _places_of(module: nn.Module) -> list[tuple[dict[str, Any], str]]:
+    """Return where a module and its children hold tensors, as parameters, buffers or attributes."""
+    holders = (holder for part in module.modules() for holder in (part._parameters, part._buffers, part.__dict__))
+    return [(holder, name) for holder in holders for name, value in holder.items() if isinstance(value, Tensor)]
 
 
 def _joined(parts: list[Tensor]) -> Tensor:

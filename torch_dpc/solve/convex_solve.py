@@ -90,7 +90,7 @@ class ConvexSolver:
         v0 = times(reduction.rows.C, times(reduction.A_theta, theta))[..., order]
         G = reduction.G[..., order[:, None], order]
         projected = sets.prox(v + gamma * lam, gamma)
-        v, lam = Implicit.apply(v0, G, projected, v, lam, solved, weak, sets, gamma)
+        v, lam = Implicit.apply(v0, G, projected, v, lam, solved, weak, sets, gamma, *sets.tensors)
         v, lam, active = (x[..., inverse] for x in (v, lam, active))
         return Planned(*self.sizes.split(v), lam, active, info)
 

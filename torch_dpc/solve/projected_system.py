@@ -157,8 +157,9 @@ def _solve(rhs: Tensor, G: Tensor, sets: FeasibleSet, gamma: Tensor, transposed:
 
 
 class Implicit(torch.autograd.Function):
-    """(v0, G, projected, v, lam, solved, weak, sets, gamma) -> v, lam at a solution found elsewhere.
+    """(v0, G, projected, v, lam, solved, weak, sets, gamma, *sets.tensors) -> v, lam at a solution found elsewhere.
 
+    The tensors of the sets are named, so that transforms know of them: D depends on them.
     `projected` is P(v + gamma lam) at the constant v + gamma lam: it carries the derivative of the set's parameters.
     A cotangent (v_bar, lam_bar) goes back by  w = K'^-1 (lam_bar - G v_bar):
 
@@ -168,35 +169,36 @@ class Implicit(torch.autograd.Function):
     @staticmethod
     def forward(
         v0: Tensor, G: Tensor, projected: Tensor, v: Tensor, lam: Tensor, solved: Tensor, weak: Tensor,
-        sets: FeasibleSet, gamma: Tensor,
+        sets: FeasibleSet, gamma: Tensor, *of_sets: Tensor,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         return torch.where(solved, v, torch.nan), lam.clone()
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
-        _, G, _, _, _, solved, weak, ctx.sets, ctx.gamma = inputs
+        _, G, _, _, _, solved, weak, ctx.sets, ctx.gamma, *of_sets = inputs
         ctx.versions = ctx.sets.versions()
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*output, G, solved, weak)
-        ctx.save_for_forward(*output, G, solved, weak)
+        ctx.save_for_backward(*output, G, solved, weak, *of_sets)
+        ctx.save_for_forward(*output, G, solved, weak, *of_sets)
 
     @staticmethod
-    def _blocks(ctx: Any, v: Tensor, lam: Tensor, solved: Tensor, weak: Tensor) -> Blocks:
-        sets = ctx.sets
-        if sets.versions() != ctx.versions:
+    def _saved(ctx: Any) -> tuple[Tensor, Tensor, Tensor, Blocks]:
+        """Return lam, G, which samples have a solution, and D there."""
+        if ctx.sets.versions() != ctx.versions:
             raise RuntimeError(
                 "a parameter of a set (a bound, a radius, ...) was changed in place between the plan and its "
                 "derivative: take the derivative first."
             )
+        v, lam, G, solved, weak, *of_sets = ctx.saved_tensors
+        sets = ctx.sets.with_tensors(of_sets)
         x = torch.where(solved, v, 0.0) + ctx.gamma * lam
-        return sets.freed(sets.jacobians(x, ctx.gamma), weak)
+        return lam, G, solved, sets.freed(sets.jacobians(x, ctx.gamma), weak)
 
     @staticmethod
     def backward(ctx: Any, v_bar: Tensor | None, lam_bar: Tensor | None) -> tuple[Tensor | None, ...]:
-        v, lam, G, solved, weak = ctx.saved_tensors
         if v_bar is None and lam_bar is None:
-            return (None,) * 9
-        blocks = Implicit._blocks(ctx, v, lam, solved, weak)
+            return (None,) * len(ctx.needs_input_grad)
+        lam, G, solved, blocks = Implicit._saved(ctx)
         # Samples without a solution add nothing, whatever came back for their NaN.
         v_bar = torch.zeros_like(lam) if v_bar is None else torch.where(solved, v_bar, 0.0)
         rhs = -times(G, v_bar)
@@ -204,14 +206,13 @@ class Implicit(torch.autograd.Function):
         w = _solve(rhs, G, ctx.sets, ctx.gamma, True, blocks)
         v0_bar = v_bar + w - ctx.sets.apply(blocks, w)
         G_bar = outer(-v0_bar, lam, G) if ctx.needs_input_grad[1] else None
-        return v0_bar, G_bar, -w, None, None, None, None, None, None
+        return v0_bar, G_bar, -w, *(None,) * (len(ctx.needs_input_grad) - 3)
 
     @staticmethod
     def jvp(
         ctx: Any, v0_t: Tensor | None, G_t: Tensor | None, projected_t: Tensor | None, *_: Any
     ) -> tuple[Tensor, Tensor]:
-        v, lam, G, solved, weak = ctx.saved_tensors
-        blocks = Implicit._blocks(ctx, v, lam, solved, weak)
+        lam, G, solved, blocks = Implicit._saved(ctx)
         free = torch.zeros_like(lam) if v0_t is None else v0_t
         if G_t is not None:
             free = free - times(G_t, lam)
@@ -223,9 +224,8 @@ class Implicit(torch.autograd.Function):
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        *tensors, sets, gamma = args
-        lifted = lead_all(tuple(tensors), in_dims[:7], (1, 2, 1, 1, 1, 1, 1), info.batch_size)
-        outputs = Implicit.apply(*lifted, sets, gamma)
+        lifted = lead_all(args[:7], in_dims[:7], (1, 2, 1, 1, 1, 1, 1), info.batch_size)
+        outputs = Implicit.apply(*lifted, *args[7:])
         return outputs, (0,) * len(outputs)
 
 
