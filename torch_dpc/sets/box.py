@@ -67,6 +67,11 @@ class Box(ConvexSet):
     def check_bounds(self) -> None:
         """Raise ValueError unless lower <= upper and a finite point lies between."""
         lower, upper = (as_tensor(bound).detach().double().cpu() for bound in (self.lower, self.upper))
+        try:
+            torch.broadcast_shapes(lower.shape, upper.shape)
+        except RuntimeError as error:
+            came = f"{tuple(lower.shape)} and {tuple(upper.shape)}"
+            raise ValueError(f"`lower` and `upper` must have shapes that broadcast, got {came}.") from error
         if not bool((lower <= upper).all()):
             raise ValueError("`lower` must be at most `upper` in every component, got crossed or NaN bounds.")
         if bool((lower == math.inf).any()) or bool((upper == -math.inf).any()):
