@@ -121,6 +121,7 @@ def test_the_soft_box_is_the_proximal_map_of_its_price():
         (lambda: dpc.Ball(-1.0), "`radius` must be finite and not negative"),
         (lambda: dpc.Ball(1.0, math.nan), "`center` must be finite"),
         (lambda: dpc.Ball(1.0, per="horizon"), '`per` must be "step" or "trajectory"'),
+        (lambda: dpc.Box(-torch.ones(3, 6, 2), torch.ones(2, 6, 2)), r"shapes that broadcast, got \(3, 6, 2\) and"),
         (lambda: dpc.Box(1.0, -1.0), "`lower` must be at most `upper`"),
         (lambda: dpc.SoftBox(-1.0, 1.0, 0.0), "`weight` must be positive"),
         (lambda: dpc.Product([(dpc.Ball(1.0), [0, 0])]), "every channel from 0 on once"),

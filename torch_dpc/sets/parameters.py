@@ -34,6 +34,11 @@ def as_tensor(bound: Tensor | float) -> Tensor:
 
 def check_order(lower: Tensor, upper: Tensor) -> None:
     """Raise ValueError unless lower <= upper and a finite point lies between; what `vmap` maps cannot be looked at."""
+    try:
+        torch.broadcast_shapes(lower.shape, upper.shape)
+    except RuntimeError as error:
+        came = f"{tuple(lower.shape)} and {tuple(upper.shape)}"
+        raise ValueError(f"`lower` and `upper` must have shapes that broadcast, got {came}.") from error
     if is_mapped(lower) or is_mapped(upper):
         return
     lower, upper = (bound.detach().double().cpu() for bound in (lower, upper))
