@@ -205,7 +205,60 @@ def test_every_transform(case):
     H = central(grad(scalar), y_ini[0], 1e-6)
     assert relative(hessian(scalar)(y_ini[0]), H) < DIFFERENCES
     assert relative(jacrev(jacrev(scalar))(y_ini[0]), H) < DIFFERENCES
+    assert relative(jacrev(jacfwd(scalar))(y_ini[0]), H) < DIFFERENCES
+    if case == "soft outputs":  # piecewise affine
+        assert relative(jacfwd(jacfwd(scalar))(y_ini[0]), H) < DIFFERENCES
+    else:
+        with pytest.raises(NotImplementedError, match="forward derivatives of forward derivatives"):
+            jacfwd(jacfwd(scalar))(y_ini[0])
     assert relative(vmap(hessian(scalar))(y_ini)[0], H) < DIFFERENCES
+
+
+@pytest.mark.parametrize("batch", [False, True])
+@pytest.mark.parametrize("case", CASES)
+def test_many_cotangents_at_once(case, batch):
+    layer, (u_ini, y_ini) = layer_of(case), inputs()
+    u_ini, y_ini = (u_ini, y_ini) if batch else (u_ini[0], y_ini[0])
+    x = y_ini.clone().requires_grad_()
+    sol = layer(u_ini, x, y_ref=Y_REF)
+    out = torch.cat([sol.u.flatten(-2), sol.y.flatten(-2), sol.lam], dim=-1)
+    cotangents = randn(3, *out.shape, seed=5)
+    one_by_one = torch.stack([torch.autograd.grad(out, x, c, retain_graph=True)[0] for c in cotangents])
+    (found,) = torch.autograd.grad(out, x, cotangents, is_grads_batched=True)
+    assert relative(found, one_by_one) < EXACT
+
+
+@pytest.mark.parametrize("case", ["ball", "cone of outputs", "product", "soft outputs", "a user's"])
+def test_the_older_vmap_has_every_rule(case):
+    """`vectorize=True` and the batched checks of torch.autograd know no rules of a Function."""
+    layer, (u_ini, y_ini) = layer_of(case), inputs()
+
+    def part(y):
+        sol = layer(u_ini[0], y, y_ref=Y_REF)
+        return torch.cat([sol.u[:2].reshape(-1) ** 3, sol.y[-1] * sol.lam[:4]])
+
+    expected = jacrev(part)(y_ini[0])
+    for strategy in ("reverse-mode", "forward-mode"):
+        found = torch.autograd.functional.jacobian(part, y_ini[0], vectorize=True, strategy=strategy)
+        assert relative(found, expected) < EXACT, strategy
+    twice = torch.autograd.functional.hessian(lambda y: part(y).sum(), y_ini[0], vectorize=True)
+    assert relative(twice, hessian(lambda y: part(y).sum())(y_ini[0])) < EXACT
+    x = y_ini[0].clone().requires_grad_()
+    batched = {"check_batched_grad": True, "check_forward_ad": True, "check_batched_forward_grad": True}
+    assert torch.autograd.gradcheck(part, x, **batched)
+
+
+def test_vmap_over_a_parameter_of_a_set_says_what_to_do():
+    u_ini, y_ini = (x[0] for x in inputs())
+    layer = dpc.DPCLayer(small_data(), **SMALL, u_set=dpc.Ball(torch.nn.Parameter(torch.tensor(0.6).double())))
+    plans = {
+        "radius": lambda r: dpc.DPCLayer(small_data(), **SMALL, u_set=dpc.Ball(r))(u_ini, y_ini).u,
+        "price": lambda w: dpc.DPCLayer(small_data(), **SMALL, y_set=dpc.SoftBox(-0.4, 0.4, w))(u_ini, y_ini).u,
+        "functional_call": lambda r: torch.func.functional_call(layer, {"u_set.radius": r}, (u_ini, y_ini)).u,
+    }
+    for plan in plans.values():
+        with pytest.raises(NotImplementedError, match="a leading batch dimension"):
+            vmap(plan)(torch.tensor([0.4, 0.6], dtype=torch.float64))
 
 
 @pytest.mark.parametrize("case", ["ball", "cone of inputs", "product"])

@@ -239,3 +239,171 @@ def test_hessians_and_their_vmap():
     for road in (hessian(loss), jacrev(jacrev(loss)), jacrev(grad(loss)), jacfwd(jacfwd(loss))):
         assert relative(road(*first), found[0]) < EXACT
     assert relative(vmap(grad(loss))(*args)[0], grad(loss)(*first)) < EXACT
+
+
+def test_the_older_vmap_has_every_rule():
+    """`vectorize=True` and the batched checks of torch.autograd know no rules of a Function."""
+    layer = bounded_layer()
+    inputs = {k: v[0] for k, v in strict_inputs(1, layer=layer).items()}
+    y_ini = inputs.pop("y_ini")
+
+    def part(y):
+        sol = layer(y_ini=y, **inputs)
+        return torch.cat([sol.u[:2].reshape(-1) ** 3, sol.y[-1] * sol.lam[:4], sol.g[:2] ** 2])
+
+    expected = jacrev(part)(y_ini)
+    for strategy in ("reverse-mode", "forward-mode"):
+        found = torch.autograd.functional.jacobian(part, y_ini, vectorize=True, strategy=strategy)
+        assert relative(found, expected) < EXACT, strategy
+    twice = torch.autograd.functional.hessian(lambda y: part(y).sum(), y_ini, vectorize=True)
+    assert relative(twice, hessian(lambda y: part(y).sum())(y_ini)) < EXACT
+    x = y_ini.clone().requires_grad_()
+    batched = {"check_batched_grad": True, "check_forward_ad": True, "check_batched_forward_grad": True}
+    assert torch.autograd.gradcheck(part, x, **batched)
+    assert torch.autograd.gradgradcheck(part, x, check_batched_grad=True)
+
+
+@pytest.mark.parametrize("u_set", [dpc.Box(-0.5, 0.5), dpc.Ball(0.5)], ids=["box", "ball"])
+def test_many_cotangents_of_a_sweep_of_weights(u_set):
+    """One matrix a sample, and the parameters of the problem differentiated too."""
+    weights = torch.tensor([0.1, 1.0, 10.0], dtype=torch.float64, requires_grad=True)
+    bound = torch.tensor(0.9, dtype=torch.float64, requires_grad=True)
+    u_ini, y_ini = windows(3, 3, seed=1, scale=0.5)
+    u = small_layer(lambda_g=weights, u_set=u_set, y_set=dpc.Box(-bound, bound))(u_ini, y_ini, y_ref=Y_REF).u
+    cotangents = randn(4, *u.shape, seed=5)
+    found = torch.autograd.grad(u, (weights, bound), cotangents, is_grads_batched=True, retain_graph=True)
+    for i, c in enumerate(cotangents):
+        for many, one in zip(found, torch.autograd.grad(u, (weights, bound), c, retain_graph=True), strict=True):
+            assert one.abs().max() > 0 and relative(many[i], one) < EXACT
+
+
+def vmapped_bounds(road):
+    """A plan as a function of the upper bound of its inputs."""
+    u_ini, y_ini = (w[0] for w in windows(1, 3, seed=1, scale=0.5))
+    if road == "set":
+        return lambda b: small_layer(u_set=dpc.Box(-0.5, b))(u_ini, y_ini, y_ref=Y_REF).u
+    layer = small_layer(u_set=dpc.Box(-0.5, torch.nn.Parameter(torch.ones((), dtype=torch.float64))))
+    if road == "functional_call":
+        return lambda b: torch.func.functional_call(layer, {"u_set.upper": b}, (u_ini, y_ini), {"y_ref": Y_REF}).u
+    theta = layer.flatten(u_ini, y_ini, Y_REF, None)[0]
+    lower, upper = (b.detach() for b in layer.bounds(theta.device))
+    return lambda b: layer.plan(theta, lower, torch.cat([b.expand(12), upper[12:]])).u
+
+
+@pytest.mark.parametrize("road", ["set", "functional_call", "plan"])
+def test_vmap_over_bounds_alone(road):
+    plan = vmapped_bounds(road)
+    bounds = torch.tensor([0.1, 0.25, 0.4], dtype=torch.float64)
+    one_by_one = torch.stack([plan(b) for b in bounds])
+    assert (one_by_one.amax((1, 2)) == bounds).all()  # every bound is met
+    assert relative(vmap(plan)(bounds), one_by_one) < EXACT
+
+    def scalar(b):
+        return (plan(b) ** 3).sum()
+
+    slopes = torch.stack([central(scalar, b) for b in bounds])
+    assert relative(vmap(grad(scalar))(bounds), slopes) < DIFFERENCES
+    assert relative(vmap(jacfwd(scalar))(bounds), slopes) < DIFFERENCES
+    curvature = torch.stack([central(grad(scalar), b) for b in bounds])
+    assert relative(vmap(hessian(scalar))(bounds), curvature) < DIFFERENCES
+    assert relative(plan(bounds[0]), one_by_one[0]) < EXACT  # nothing mapped was kept
+
+
+@pytest.mark.parametrize("bad", [-0.6, float("nan")])
+def test_mapped_bounds_are_checked_too(bad):
+    bounds = torch.tensor([0.5, bad], dtype=torch.float64)
+    by_set, by_call = vmapped_bounds("set"), vmapped_bounds("functional_call")
+    for road in (vmap(by_set), vmap(grad(lambda b: by_call(b).sum()))):
+        with pytest.raises(ValueError, match="at most `upper`"):
+            road(bounds)
+
+
+@pytest.mark.parametrize("u_set", [dpc.Box(-0.5, 0.5), dpc.Ball(0.5)], ids=["box", "ball"])
+@pytest.mark.parametrize("name", ["lambda_g", "lambda_s", "R", "Q"])
+def test_every_transform_over_a_weight(name, u_set):
+    value = torch.diag(torch.tensor([10.0, 8.0, 5.0, 1.0])).double() if name == "Q" else torch.tensor(2.0).double()
+    layer = small_layer(u_set=u_set, **{name: torch.nn.Parameter(value.clone())})
+    u_ini, y_ini = (w[0] for w in windows(1, 3, seed=1, scale=0.5))
+    y_ini = y_ini + 0.1 * randn(3, 4, seed=2)
+    diagonal = value.diagonal() if value.ndim else value
+
+    def plan(x):
+        given = {name: torch.diag(x) if x.ndim else x}
+        return torch.func.functional_call(layer, given, (u_ini, y_ini), {"y_ref": Y_REF}).u
+
+    def scalar(x):
+        return (plan(x) ** 3).sum()
+
+    J = central(plan, diagonal)
+    assert J.abs().max() > 1e-6
+    for road in (jacrev, jacfwd):
+        assert relative(road(plan)(diagonal), J) < DIFFERENCES, road.__name__
+    for strategy in ("reverse-mode", "forward-mode"):
+        rows = torch.autograd.functional.jacobian(plan, diagonal, vectorize=True, strategy=strategy)
+        assert relative(rows, J) < DIFFERENCES, strategy
+    found = {"forward": hessian(scalar)(diagonal), "backward": jacrev(jacrev(scalar))(diagonal)}
+    found["backward over forward"] = jacrev(jacfwd(scalar))(diagonal)
+    found["older vmap"] = torch.autograd.functional.hessian(scalar, diagonal, vectorize=True)
+    H = central(grad(scalar), diagonal)
+    for road, second in found.items():
+        assert relative(second, H) < DIFFERENCES, road
+    with pytest.raises(NotImplementedError, match="forward derivatives of forward derivatives"):
+        jacfwd(jacfwd(scalar))(diagonal)
+    with pytest.raises(NotImplementedError, match=f"`{name}` a leading batch dimension"):
+        vmap(plan)(torch.stack([diagonal, 2 * diagonal]))
+
+
+@pytest.mark.parametrize("u_set", [dpc.Box(-0.5, 0.5), dpc.Ball(0.5)], ids=["box", "ball"])
+@pytest.mark.parametrize("road", [hessian, jacrev, jacfwd, vmap])
+def test_a_first_call_within_a_transform_leaves_a_sound_layer(road, u_set):
+    u_ini, y_ini = (w[0] for w in windows(1, 3, seed=1, scale=0.5))
+
+    def loss(layer):
+        return lambda y: (layer(u_ini, y, y_ref=Y_REF).u ** 3).sum()
+
+    layer, used = small_layer(u_set=u_set), small_layer(u_set=u_set)
+    used(u_ini, y_ini, y_ref=Y_REF)
+    x = y_ini[None] if road is vmap else y_ini
+    expected = road(loss(used))(x)
+    assert relative(road(loss(layer))(x), expected) < EXACT
+    assert relative(road(lambda y: loss(small_layer(u_set=u_set))(y))(x), expected) < EXACT  # made within it
+    assert relative(hessian(loss(layer))(y_ini), hessian(loss(used))(y_ini)) < EXACT
+    y = y_ini.clone().requires_grad_()
+    assert relative(torch.autograd.grad(loss(layer)(y), y)[0], grad(loss(used))(y_ini)) < EXACT
+
+
+@pytest.mark.parametrize("u_set", [dpc.Box(-0.5, 0.5), dpc.Ball(0.5)], ids=["box", "ball"])
+@pytest.mark.parametrize("name", ["lambda_g", "bound", "data"])
+def test_an_outer_derivative_is_seen_from_within_an_inner_one(name, u_set):
+    """The slope of a gradient in y_ini, as a weight, a bound or the data change: each has a transform of its own."""
+    u_ini, y_ini = (w[0] for w in windows(1, 3, seed=1, scale=0.5))
+    u, y = dpc.collect(dpc.systems.OscillatingMasses(noise=0.02, generator=torch.Generator().manual_seed(5)), 90)
+    direction, way = randn(3, 4, seed=9), randn(*y.shape, seed=10)
+    curved = isinstance(u_set, dpc.Ball)
+
+    def loss(x, y_ini):
+        if name == "lambda_g":
+            layer = small_layer(lambda_g=2 * x, u_set=u_set)
+        elif name == "bound":
+            layer = small_layer(u_set=dpc.Ball(x * x.exp()) if curved else dpc.Box(-0.5, x * x.exp()))
+        else:
+            data = dpc.HankelData.from_trajectories(u, y + 0.1 * x * way, t_ini=3, horizon=6)
+            layer = dpc.DPCLayer(data, 10.0, 1.0, 1.0, 1e3, u_set=u_set)
+        return (layer(u_ini, y_ini, y_ref=Y_REF).u ** 3).sum()
+
+    def by_grad(x):
+        return (grad(lambda y: loss(x, y))(y_ini) * direction).sum()
+
+    def by_jvp(x):
+        return jvp(lambda y: loss(x, y), (y_ini,), (direction,))[1]
+
+    at = torch.tensor(0.35, dtype=torch.float64)
+    expected = central(by_grad, at)
+    assert expected.abs() > 1e-3
+    for inner in (by_grad, by_jvp):
+        assert relative(grad(inner)(at), expected) < 1e-5, inner.__name__
+    if name != "data":
+        assert relative(jacfwd(by_grad)(at), expected) < 1e-5
+    if name == "lambda_g" or (name == "bound" and curved):
+        with pytest.raises(NotImplementedError, match="forward derivatives of forward derivatives"):
+            jacfwd(by_jvp)(at)

@@ -23,11 +23,12 @@ import torch
 from torch import Tensor
 
 from .errors import Status
-from .linear import flatten_batch, lead_all, outer, times
+from .linear import flatten_batch, lead_all, outer, times, unit_vectors
 from .problem.projected_kkt import FullAdjoint
 from .problem.reduction import Reduction
+from .sets.parameters import check_order
 from .solve import kernels
-from .solve.active_set import adjoint, adjoint_dense, solve_active
+from .solve.active_set import adjoint, solve_active
 from .solve.solver import Planned, Solver
 from .transforms import apply_function, carries_derivative, is_grads_batched, is_plain
 
@@ -36,7 +37,7 @@ def solve_reduced(solver: Solver, theta: Tensor, reduction: Reduction, lower: Te
     """Solve for every theta `(*batch, n_theta)`; differentiable in theta, the reduction and the bounds."""
     matrices: tuple[Tensor | None, ...] = (reduction.A_theta, reduction.rows.C, reduction.G)
     if not carries_derivative(matrices):
-        if not carries_derivative((theta, lower, upper)) and is_plain(theta):
+        if not carries_derivative((theta, lower, upper)) and all(map(is_plain, (theta, lower, upper))):
             return solver.solve(theta, lower, upper)  # a third of the time of a small call is the Function's
         matrices = (None, None, None)  # constants: those of the solver will do, and need not be saved
     return Planned(*apply_function(SolveReduced, theta, *matrices, lower, upper, solver))
@@ -96,7 +97,8 @@ class SolveReduced(torch.autograd.Function):
             return FullAdjoint.apply(v_bar, lam_bar, active, solver.full), *(None,) * 6
         theta, A, C, G = matrices or _constants(solver)
         if is_grads_batched(v_bar):
-            v0_bar = adjoint_dense(G, active, v_bar, lam_bar)
+            rhs = -times(G, v_bar)
+            v0_bar = v_bar + _on_active(rhs if lam_bar is None else rhs + lam_bar, active, G, solver.reduction.Ct)
         else:  # the Function only where something will be derived again
             adjoin = SolveAdjoint.forward if at_last else SolveAdjoint.apply
             v0_bar = adjoin(v_bar, lam_bar, active, G, solver.reduction.Ct)
@@ -140,7 +142,7 @@ class SolveReduced(torch.autograd.Function):
             rhs = rhs - torch.where(lam < 0, lower_t, 0.0)
         if upper_t is not None:
             rhs = rhs - torch.where(lam < 0, 0.0, upper_t)
-        lam_t = SolveActive.apply(rhs * solved, active, G, ctx.solver.reduction.Ct)
+        lam_t = _on_active(rhs * solved, active, G, ctx.solver.reduction.Ct)
         v_t = torch.where(solved, free - times(G, lam_t), 0.0)
         return *ctx.solver.sizes.split(v_t), lam_t, None, None
 
@@ -155,6 +157,9 @@ class SolveReduced(torch.autograd.Function):
         theta, lower, upper = lead_all(
             (theta, lower, upper), (in_dims[0], in_dims[4], in_dims[5]), (1, 1, 1), info.batch_size
         )
+        if in_dims[4] is not None or in_dims[5] is not None:
+            assert lower is not None and upper is not None
+            check_order(lower, upper)  # the box could not look at them
         outputs = SolveReduced.apply(theta, A, C, G, lower, upper, solver)
         return outputs, (0,) * len(outputs)
 
@@ -198,7 +203,7 @@ class SolveAdjoint(torch.autograd.Function):
     def backward(ctx: Any, bar: Tensor) -> tuple[Tensor | None, ...]:
         active, G, Ct, v0_bar = ctx.saved_tensors
         need = ctx.needs_input_grad
-        s = SolveActive.apply(bar, active, G, Ct)
+        s = _on_active(bar, active, G, Ct)
         v_bar_bar = bar - times(G, s) if need[0] else None
         G_bar = outer(-s, v0_bar, G) if need[3] else None
         return v_bar_bar, s if need[1] else None, None, G_bar, None
@@ -209,6 +214,9 @@ class SolveAdjoint(torch.autograd.Function):
         v_t = torch.zeros_like(v0_bar) if v_t is None else v_t
         if G_t is not None:
             lam_t = -times(G_t, v0_bar) + (0.0 if lam_t is None else lam_t)
+        if is_grads_batched(v_t) or (lam_t is not None and is_grads_batched(lam_t)):
+            rhs = -times(G, v_t)
+            return v_t + _on_active(rhs if lam_t is None else rhs + lam_t, active, G, Ct)
         return SolveAdjoint.apply(v_t, lam_t, active, G, Ct)
 
     @staticmethod
@@ -235,7 +243,7 @@ class SolveActive(torch.autograd.Function):
     @staticmethod
     def backward(ctx: Any, s_bar: Tensor) -> tuple[Tensor | None, ...]:
         active, G, Ct, s = ctx.saved_tensors
-        rhs_bar = SolveActive.apply(s_bar, active, G, Ct)
+        rhs_bar = _on_active(s_bar, active, G, Ct)
         G_bar = outer(-rhs_bar, s, G) if ctx.needs_input_grad[2] else None
         return rhs_bar, None, G_bar, None
 
@@ -245,11 +253,18 @@ class SolveActive(torch.autograd.Function):
         rhs_t = torch.zeros_like(s) if rhs_t is None else rhs_t
         if G_t is not None:
             rhs_t = rhs_t - times(G_t, s)
-        return SolveActive.apply(rhs_t, active, G, Ct)
+        return _on_active(rhs_t, active, G, Ct)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], *args: Tensor) -> tuple[Tensor, int]:
         return SolveActive.apply(*lead_all(args, in_dims, (1, 1, 2, 2), info.batch_size)), 0
+
+
+def _on_active(rhs: Tensor, active: Tensor, G: Tensor, Ct: Tensor) -> Tensor:
+    """Return what `SolveActive` does, also for the many right-hand sides of the older `vmap`: by the inverse."""
+    if not is_grads_batched(rhs):
+        return SolveActive.apply(rhs, active, G, Ct)
+    return times(SolveActive.apply(unit_vectors(rhs), active, G, Ct).movedim(0, -1), rhs)
 
 
 # `apply` binds its arguments by the signature of `forward` at every call; finding it anew each time costs 15 us.

@@ -28,7 +28,7 @@ from .settings import DOORS, Setup, check_choice, settings_of
 from .solution import DPCSolution, SolveInfo
 from .solve.convex_solve import ConvexSolver
 from .solve.solver import Planned, Solver
-from .transforms import carries_derivative
+from .transforms import carries_derivative, untransformed
 
 
 class DPCLayer(nn.Module):
@@ -387,7 +387,7 @@ class DPCLayer(nn.Module):
         """Return what `make` makes of the sources, made anew when their values have changed."""
         entry = self._cache.get(key)
         if entry is None or not all(map(_is_same, entry[0], sources)):
-            with torch.inference_mode(False), torch.no_grad():  # later calls may differentiate
+            with torch.inference_mode(False), torch.no_grad(), untransformed():  # later calls may differentiate
                 kept = tuple(s.detach().clone() if isinstance(s, Tensor) else s for s in sources)
                 entry = self._cache[key] = (kept, make(*args))
         return entry[1]
@@ -406,7 +406,7 @@ class DPCLayer(nn.Module):
             return reduction, ConvexSolver(detached, setup.sizes, setup.sets, self.on_failure)
         full = None
         if self.backward_system == "full":
-            if reduction.V.requires_grad or reduction.V.ndim > 2:
+            if carries_derivative((reduction.V,)) or reduction.V.ndim > 2:
                 raise ValueError(
                     'backward="full" differentiates with respect to measurements and references of one problem; '
                     'use backward="reduced" for weights or data that learn, or have a batch dimension.'
@@ -435,7 +435,7 @@ def _g(data: HankelData | HankelBatch, reduction: Reduction, theta: Tensor, lam:
     data.require_windows()
     a = times(reduction.A_theta, theta) - times(reduction.A_lam, lam)
     g = times(basis := data.basis.to(a.device), a)
-    if reduction.rows.C.requires_grad:  # g = D^+ (D g), so that the data behind D are differentiated too
+    if carries_derivative((reduction.rows.C,)):  # g = D^+ (D g), so that the data behind D are differentiated too
         D = data.stacked.to(a.device)
         g = times(torch.linalg.pinv(D, rtol=1e-10), times(D @ basis, a))
     return torch.where(info[..., :1] == Status.SOLVED, g, torch.nan)

@@ -9,8 +9,15 @@ from torch import Tensor
 def times(matrix: Tensor, x: Tensor) -> Tensor:
     """Return matrix x for vectors `(*batch, n)`; the matrix is `(m, n)`, shared, or `(*batch, m, n)`."""
     if matrix.ndim == 2:
-        return x @ matrix.mT
+        # Not x @ matrix.mT, which makes the vector a matrix, where the older `vmap` loses a forward derivative.
+        return matrix.mv(x) if x.ndim == 1 else x @ matrix.mT
     return (matrix @ x[..., None])[..., 0]
+
+
+def unit_vectors(like: Tensor) -> Tensor:
+    """Return the unit vectors `(n, *1, n)`, a leading dimension of vectors `(*batch, n)` that broadcast to `like`."""
+    n = like.shape[-1]
+    return torch.eye(n, dtype=like.dtype, device=like.device).reshape(n, *(1,) * (like.ndim - 1), n)
 
 
 def outer(y: Tensor, x: Tensor, like: Tensor) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import contextlib
 from typing import Any
 
 import torch
@@ -18,6 +19,31 @@ _are_transforms_active = getattr(torch._C, "_are_functorch_transforms_active", l
 def is_plain(tensor: Tensor) -> bool:
     """Return whether a tensor holds its own numbers: no `vmap` or `torch.func` transform has wrapped it."""
     return type(tensor) is Tensor and not _is_wrapped(tensor) and not _is_legacy_batched(tensor)
+
+
+def is_mapped(value: Any) -> bool:
+    """Return whether `vmap` maps a tensor, perhaps below other transforms: no decision can follow from its numbers."""
+    while isinstance(value, Tensor) and _is_wrapped(value) and _functorch is not None:
+        if _functorch.is_batchedtensor(value):
+            return True
+        value = _functorch.get_unwrapped(value)
+    return isinstance(value, Tensor) and _is_legacy_batched(value)
+
+
+def refuse_forward_twice() -> None:
+    """Raise NotImplementedError within a forward derivative of a forward derivative.
+
+    Within the `jvp` of a Function torch keeps no other tangent: what the `jvp` itself depends on is lost without a
+    word. Where it depends on nothing, as at boxes with constant weights, this does not matter.
+    """
+    if _functorch is None:
+        return
+    stack = _functorch.get_interpreter_stack() or []
+    if sum(level.key() == _functorch.TransformType.Jvp for level in stack) > 1:
+        raise NotImplementedError(
+            "forward derivatives of forward derivatives (jacfwd of jacfwd, jvp of jvp) are there for boxes with "
+            "constant weights: take one of the two backward, as `hessian` does."
+        )
 
 
 def apply_function(function: type[torch.autograd.Function], *args: Any) -> Any:
@@ -39,12 +65,34 @@ def is_grads_batched(tensor: Tensor) -> bool:
     return _is_legacy_batched(tensor)
 
 
+def untransformed() -> contextlib.AbstractContextManager[Any]:
+    """Return a context without transforms, for what outlives the call; there every tensor must be plain.
+
+    Within one, even a new tensor is wrapped, and its wrapper is no good once the transform has ended.
+    """
+    return getattr(torch._C, "_DisableFuncTorch", contextlib.nullcontext)()
+
+
+def constant(tensor: Tensor) -> Tensor:
+    """Return a tensor's numbers, without its graph, its tangent, and the wrappers of `torch.func.grad` and `jvp`."""
+    if _functorch is None or not _are_transforms_active():
+        return tensor.detach()
+    with untransformed():
+        while _functorch.is_gradtrackingtensor(tensor):
+            tensor = _functorch.get_unwrapped(tensor)
+        return tensor.detach()
+
+
 def carries_derivative(values: tuple[Any, ...]) -> bool:
-    """Return whether a derivative, backward or forward, may be asked of one of the tensors among values."""
-    if torch.is_grad_enabled():
-        for value in values:
-            if isinstance(value, Tensor) and value.requires_grad:
-                return True
+    """Return whether a derivative, backward or forward, may be asked of one of the tensors among values.
+
+    What a transform has wrapped counts: a derivative that an outer one asks for is not seen from within an inner one.
+    """
+    tensors = [value for value in values if isinstance(value, Tensor)]
+    if _are_transforms_active() and not all(map(is_plain, tensors)):
+        return True
+    if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
+        return True
     if getattr(forward_ad, "_current_level", 0) < 0:  # no forward derivative is under way: spare the look at each
         return False
-    return any(forward_ad.unpack_dual(v).tangent is not None for v in values if isinstance(v, Tensor))
+    return any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)

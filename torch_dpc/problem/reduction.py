@@ -26,6 +26,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..transforms import carries_derivative, constant, untransformed
 from .rows import DataRows
 from .saddle import Saddle, known_solution
 from .weights import Weights, psd_root
@@ -67,9 +68,10 @@ class Reduction:
 
         With a graph G is C A_lam; here it is Ct Ct' in any case, which loses less, so that a graph changes no result.
         """
-        rows, weights = (part.map(lambda tensor, _: tensor.detach()) for part in (self.rows, self.weights))
-        plain = _map_tensors(self, Tensor.detach)
-        return replace(plain, G=plain.Ct @ plain.Ct.mT, rows=rows, weights=weights)
+        rows, weights = _constants(self.rows, self.weights)
+        plain = _map_tensors(self, constant)
+        with untransformed():
+            return replace(plain, G=plain.Ct @ plain.Ct.mT, rows=rows, weights=weights)
 
     def of_batch(self, batch: torch.Size) -> Reduction:
         """Return one problem a sample of a flattened batch; itself where all samples share one problem."""
@@ -108,26 +110,38 @@ def reduce(rows: DataRows, weights: Weights) -> Reduction:
     Values come from the QR of E. Where the data or the weights carry a graph, V, G, A_theta and A_lam carry it on, by
     the derivative of the saddle-point system they solve (:mod:`torch_dpc.problem.saddle`).
     """
-    with torch.no_grad():
-        E, f = _least_squares(rows, weights)
-        T, Qe, is_selection = _factor(E)
-        CZ = rows.C @ rows.Z
-        # A row that the equalities decide is zero here; its rounding would stand for a motion that does not exist.
-        decided = CZ.norm(dim=-1) <= DECIDED * rows.C.norm(dim=-1)
-        CZ = torch.where(decided[..., None], 0.0, CZ)
-        Ct = torch.linalg.solve_triangular(T, CZ, upper=True, left=False)
-        X_theta = torch.linalg.solve_triangular(T, Qe.mT @ f, upper=True)
-        # One step of refinement: it matters where weights of zero leave E a condition of 1e10.
-        X_theta = X_theta + torch.linalg.solve_triangular(T, Qe.mT @ (f - E @ X_theta), upper=True)
-        A_theta = rows.Z @ X_theta
-        A_theta[..., :, rows.Eq_theta] += rows.Eq_pinv
-        A_lam = rows.Z @ torch.linalg.solve_triangular(T, Ct.mT, upper=True)
-        V, G = rows.C @ A_theta, Ct @ Ct.mT
-    tensors = (rows.C, rows.Yp, *weights.tensors.values())
-    if torch.is_grad_enabled() and any(t.requires_grad for t in tensors):
+    V, G, Ct, A_theta, A_lam, T, is_selection = _values(*_constants(rows, weights))
+    if carries_derivative((rows.C, rows.Yp, *weights.tensors.values())):
         A_theta, A_lam = _with_graph(rows, weights, T, A_theta, A_lam)
         V, G = rows.C @ A_theta, rows.C @ A_lam
     return Reduction(V, G, Ct, A_theta, A_lam, rows, weights, is_selection)
+
+
+def _constants(rows: DataRows, weights: Weights) -> tuple[DataRows, Weights]:
+    """Return both without graph or tangent: of equal eigenvalues, say, a factorisation has no derivative."""
+
+    def change(tensor: Tensor, _: int) -> Tensor:
+        return constant(tensor)
+
+    return rows.map(change), weights.map(change)
+
+
+def _values(rows: DataRows, weights: Weights) -> tuple[Any, ...]:
+    """Return V, G, Ct, A_theta, A_lam, T and whether the kernel of E had to be charged."""
+    E, f = _least_squares(rows, weights)
+    T, Qe, is_selection = _factor(E)
+    CZ = rows.C @ rows.Z
+    # A row that the equalities decide is zero here; its rounding would stand for a motion that does not exist.
+    decided = CZ.norm(dim=-1) <= DECIDED * rows.C.norm(dim=-1)
+    CZ = torch.where(decided[..., None], 0.0, CZ)
+    Ct = torch.linalg.solve_triangular(T, CZ, upper=True, left=False)
+    X_theta = torch.linalg.solve_triangular(T, Qe.mT @ f, upper=True)
+    # One step of refinement: it matters where weights of zero leave E a condition of 1e10.
+    X_theta = X_theta + torch.linalg.solve_triangular(T, Qe.mT @ (f - E @ X_theta), upper=True)
+    A_theta = rows.Z @ X_theta
+    A_theta[..., :, rows.Eq_theta] += rows.Eq_pinv
+    A_lam = rows.Z @ torch.linalg.solve_triangular(T, Ct.mT, upper=True)
+    return rows.C @ A_theta, Ct @ Ct.mT, Ct, A_theta, A_lam, T, is_selection
 
 
 def _least_squares(rows: DataRows, weights: Weights) -> tuple[Tensor, Tensor]:
@@ -214,7 +228,7 @@ def _gram_of_charged(rows: DataRows) -> Tensor:
     N = _charged(rows)
     M = N.mT @ N
     W = torch.cat([rows.Up, rows.Yp, rows.Uf], dim=-2)
-    if not W.requires_grad or rows.is_identity:
+    if not carries_derivative((W,)) or rows.is_identity:
         return M
     with torch.no_grad():
         W_pinv = torch.linalg.pinv(W, rtol=1e-10)

@@ -21,6 +21,7 @@ from torch import Tensor
 from ..data.hankel import HankelData
 from ..linear import times
 from ..transforms import carries_derivative
+from .data_derivative import in_row_space
 
 #: How far u_ini may be from what the data can produce, relative to its norm.
 REACHABLE = 1e-8
@@ -161,7 +162,7 @@ class DataRows:
             )
         basis = space.basis.to(device)
         stacked = data.stacked.to(device)
-        rows = _InRowSpace.apply(stacked, basis) if carries_derivative(data.matrices) else stacked @ basis
+        rows = in_row_space(stacked, basis) if carries_derivative(data.matrices) else stacked @ basis
         Up, Yp, Uf, Yf = rows.split([len(m) for m in data.matrices])
         u_ref = len(Up) + len(Yp)
         y_ref = u_ref + len(Uf)
@@ -224,28 +225,3 @@ def _eliminate(Eq: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
         pinv = (right_h[:rank].T / singular[:rank]) @ left[:, :rank].T
         reached = None if rank == len(Eq) else left[:, :rank].contiguous()
         return pinv, right_h[rank:].T.contiguous(), reached
-
-
-class _InRowSpace(torch.autograd.Function):
-    """(D, B) -> D B for an orthonormal basis B of the rows of D, which moves with D.
-
-    What follows depends on D through D D' alone, so that to first order, and only so, B may be taken as fixed:
-    D_bar = bar B'. A derivative of that is refused.
-    """
-
-    @staticmethod
-    def forward(D: Tensor, basis: Tensor) -> Tensor:  # noqa: D102
-        return D @ basis
-
-    @staticmethod
-    def setup_context(ctx: object, inputs: tuple[Tensor, Tensor], output: Tensor) -> None:  # noqa: D102
-        ctx.save_for_backward(inputs[1])  # type: ignore[attr-defined]
-
-    @staticmethod
-    def backward(ctx: object, bar: Tensor) -> tuple[Tensor, None]:  # noqa: D102
-        if torch.is_grad_enabled() and bar.requires_grad:
-            raise NotImplementedError(
-                "the derivative with respect to the recorded data is of first order: it cannot be taken with "
-                "`create_graph=True`. Detach the data, or ask for first derivatives."
-            )
-        return bar @ ctx.saved_tensors[0].mT, None  # type: ignore[attr-defined]

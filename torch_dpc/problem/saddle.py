@@ -18,6 +18,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..linear import lead_all
+from ..transforms import carries_derivative, constant, refuse_forward_twice
+
 
 @dataclass(frozen=True, eq=False)
 class Saddle:
@@ -41,9 +44,10 @@ class Saddle:
 
 def known_solution(Psi: Tensor, Eq: Tensor, top: Tensor, bottom: Tensor, a: Tensor, saddle: Saddle) -> Tensor:
     """Return the solution `a`, computed elsewhere to full precision, with the derivative of the solve attached."""
+    refuse_forward_twice()
     # mu is seen by the cotangent of Eq alone, and costs as much as the rest.
-    mu = saddle.multipliers(Psi.detach(), top.detach(), a) if Eq.requires_grad else torch.zeros_like(bottom)
-    solved, _ = _SaddleSolve.apply(Psi, Eq, top, bottom, a, mu, saddle)
+    mu = saddle.multipliers(constant(Psi), constant(top), a) if carries_derivative((Eq,)) else torch.zeros_like(bottom)
+    solved, _ = _SaddleSolve.apply(Psi, Eq, top, bottom, a, mu, saddle.T, saddle.Z, saddle.Eq_pinv)
     return solved
 
 
@@ -52,26 +56,54 @@ class _SaddleSolve(torch.autograd.Function):
 
     @staticmethod
     def forward(
-        Psi: Tensor, Eq: Tensor, top: Tensor, bottom: Tensor, a: Tensor, mu: Tensor, saddle: Saddle
+        Psi: Tensor, Eq: Tensor, top: Tensor, bottom: Tensor, a: Tensor, mu: Tensor, *factors: Tensor
     ) -> tuple[Tensor, Tensor]:
         return a.clone(), mu.clone()
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
-        Psi, Eq, _, _, _, _, saddle = inputs
-        ctx.save_for_backward(Psi, Eq, *output, saddle.T, saddle.Z, saddle.Eq_pinv)
+        Psi, Eq, _, _, _, _, *factors = inputs
+        ctx.save_for_backward(Psi, Eq, *output, *factors)
+        ctx.save_for_forward(Psi, Eq, *output, *factors)
 
     @staticmethod
     def backward(ctx: Any, *cotangents: Tensor) -> tuple[Tensor | None, ...]:
-        Psi, Eq, a, mu, T, Z, Eq_pinv = ctx.saved_tensors
-        saddle = Saddle(T, Z, Eq_pinv)
+        Psi, Eq, a, mu, *factors = ctx.saved_tensors
+        saddle = Saddle(*factors)
         a_bar, mu_bar = cotangents
-        moves = ctx.needs_input_grad[1] or ctx.needs_input_grad[3]
+        # A derivative in Eq that an outer transform asks for is not among those needed here.
+        moves = ctx.needs_input_grad[1] or ctx.needs_input_grad[3] or carries_derivative((Eq,))
         with torch.no_grad():
             s = saddle.solve(Psi, a_bar, mu_bar)
             t = saddle.multipliers(Psi, a_bar, s) if moves else torch.zeros_like(mu_bar)
         if torch.is_grad_enabled():
-            s, t = _SaddleSolve.apply(Psi, Eq, a_bar, mu_bar, s, t, saddle)
+            s, t = _SaddleSolve.apply(Psi, Eq, a_bar, mu_bar, s, t, *factors)
         Psi_bar = -s @ a.mT
         Eq_bar = -(mu @ s.mT + t @ a.mT).sum_to_size(Eq.shape) if moves else None
-        return Psi_bar.sum_to_size(Psi.shape), Eq_bar, s, t if moves else None, None, None, None
+        return Psi_bar.sum_to_size(Psi.shape), Eq_bar, s, t if moves else None, *(None,) * 5
+
+    @staticmethod
+    def jvp(
+        ctx: Any, Psi_t: Tensor | None, Eq_t: Tensor | None, top_t: Tensor | None, bottom_t: Tensor | None, *_: Any
+    ) -> tuple[Tensor, Tensor]:
+        Psi, Eq, a, mu, *factors = ctx.saved_tensors
+        saddle = Saddle(*factors)
+        top = torch.zeros_like(a) if top_t is None else top_t
+        bottom = torch.zeros_like(mu) if bottom_t is None else bottom_t
+        if Psi_t is not None:
+            top = top - Psi_t @ a
+        if Eq_t is not None:
+            top, bottom = top - Eq_t.mT @ mu, bottom - Eq_t @ a
+        with torch.no_grad():
+            a_t = saddle.solve(Psi, top, bottom)
+            mu_t = saddle.multipliers(Psi, top, a_t)
+        return _SaddleSolve.apply(Psi, Eq, top, bottom, a_t, mu_t, *factors)
+
+    @staticmethod
+    def vmap(info: Any, in_dims: tuple[Any, ...], *args: Tensor) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
+        tensors, dims = list(args), list(in_dims)
+        for place in (4, 5):  # a and mu are the outputs, which are mapped whichever input is
+            if dims[place] is None:
+                tensors[place], dims[place] = tensors[place].expand(info.batch_size, *tensors[place].shape), 0
+        outputs = _SaddleSolve.apply(*lead_all(tuple(tensors), tuple(dims), (2,) * len(args), info.batch_size))
+        return outputs, (0, 0)

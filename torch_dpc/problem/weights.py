@@ -8,6 +8,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..transforms import is_mapped
+
 #: Asymmetry of Q or R, relative to its largest entry, up to which it is rounding and is averaged away.
 ASYMMETRY = 1e-6
 #: An eigenvalue of Q or R below minus this fraction of the largest makes the matrix indefinite.
@@ -102,6 +104,11 @@ def penalty(name: str, value: Any) -> Tensor:
 
 def as_weight(name: str, value: Any) -> Tensor:
     """Return a weight as a finite float64 tensor; a graph is kept."""
+    if is_mapped(value):
+        raise NotImplementedError(
+            f"vmap over weights is not supported: give `{name}` a leading batch dimension, of which the "
+            "layer makes one batched factorisation."
+        )
     if isinstance(value, Tensor):
         if not value.is_floating_point():
             raise ValueError(f"`{name}` must hold floating-point numbers, got {value.dtype}.")

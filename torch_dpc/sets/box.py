@@ -8,8 +8,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..transforms import is_mapped
 from .base import ConvexSet
-from .parameters import as_bound, as_tensor, short
+from .parameters import as_bound, as_tensor, check_order, short
 
 
 class Box(ConvexSet):
@@ -65,17 +66,8 @@ class Box(ConvexSet):
         return (lower == upper).expand_as(x)
 
     def check_bounds(self) -> None:
-        """Raise ValueError unless lower <= upper and a finite point lies between."""
-        lower, upper = (as_tensor(bound).detach().double().cpu() for bound in (self.lower, self.upper))
-        try:
-            torch.broadcast_shapes(lower.shape, upper.shape)
-        except RuntimeError as error:
-            came = f"{tuple(lower.shape)} and {tuple(upper.shape)}"
-            raise ValueError(f"`lower` and `upper` must have shapes that broadcast, got {came}.") from error
-        if not bool((lower <= upper).all()):
-            raise ValueError("`lower` must be at most `upper` in every component, got crossed or NaN bounds.")
-        if bool((lower == math.inf).any()) or bool((upper == -math.inf).any()):
-            raise ValueError("`lower` must be below +infinity and `upper` above -infinity.")
+        """Raise ValueError unless lower <= upper with a finite point between; the solve tells of what `vmap` maps."""
+        check_order(as_tensor(self.lower), as_tensor(self.upper))
 
     def project(self, x: Tensor) -> Tensor:
         lower, upper = self.bounds(x)
@@ -172,7 +164,8 @@ class SoftBox(ConvexSet):
 
     def check_values(self) -> None:
         self.box.check_bounds()
-        if not bool((as_tensor(self.weight).detach() > 0).all()):  # NaN is not either
+        # NaN is not positive either.
+        if not is_mapped(self.weight) and not bool((as_tensor(self.weight).detach() > 0).all()):
             raise ValueError("`weight` must be positive: without a price there is no bound.")
 
     def project(self, x: Tensor) -> Tensor:

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..transforms import is_mapped
 from .base import ConvexSet
 from .parameters import as_bound, as_tensor, short
 
@@ -32,6 +33,8 @@ class Ball(ConvexSet):
         self.check_values()
 
     def check_values(self) -> None:
+        if is_mapped(self.radius) or is_mapped(self.center):
+            return
         value = as_tensor(self.radius).detach()
         if not bool((value >= 0).all()) or not bool(torch.isfinite(value).all()):
             raise ValueError("`radius` must be finite and not negative.")

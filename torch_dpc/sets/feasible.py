@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, cast
@@ -11,9 +11,9 @@ import torch
 from torch import Tensor, nn
 
 from ..checks import one_batch
-from ..transforms import is_plain
+from ..transforms import is_mapped, is_plain
 from .base import ConvexSet, Part
-from .box import Box
+from .box import Box, SoftBox
 from .product import Product
 
 #: The Jacobian of the projection, part by part: its diagonal `(..., groups, size)` where the set is separable, blocks
@@ -54,8 +54,20 @@ class FeasibleSet:
 
     def versions(self) -> list[int]:
         """Return torch's count of the changes in place of every parameter of the sets."""
-        tensors = (x for owner, _ in self.parts for x in _tensors_of(owner))
-        return [x._version for x in tensors if is_plain(x.data if isinstance(x, nn.Parameter) else x)]
+        return [x._version for x in self.tensors if is_plain(x.data if isinstance(x, nn.Parameter) else x)]
+
+    @property
+    def tensors(self) -> list[Tensor]:
+        """The tensors that the sets hold."""
+        return [holder[name] for owner, _ in self.parts for holder, name in _places_of(owner)]
+
+    def with_tensors(self, tensors: Iterable[Tensor]) -> FeasibleSet:
+        """Return a snapshot with these in place of `tensors`."""
+        copy = self.snapshot()
+        places = [place for owner, _ in copy.parts for place in _places_of(owner)]
+        for (holder, name), tensor in zip(places, tensors, strict=True):
+            holder[name] = tensor
+        return copy
 
     def snapshot(self) -> FeasibleSet:
         """Return the same sets with the parameters that they have now."""
@@ -110,6 +122,11 @@ class FeasibleSet:
         """Whether all sets together are a box."""
         return all(_is_box(owner) for owner, _ in self.parts)
 
+    @property
+    def is_piecewise_affine(self) -> bool:
+        """Whether the projection certainly is: its Jacobian then has no derivative."""
+        return all(_is_box(owner) or type(owner) is SoftBox for owner, _ in self.parts)
+
     def bounds(self, device: torch.device) -> tuple[Tensor, Tensor]:
         """Return lower and upper of v where the sets are a box, `(..., N)` each, float64, with their graph."""
         like = torch.empty(0, dtype=torch.float64, device=device)
@@ -125,7 +142,7 @@ class FeasibleSet:
                     owner.check(name, *places.shape)
                     raise
                 shapes.append((name, value.shape[:-2]))
-                side.append(full.flatten(-2))
+                side.append(_flat(full))
         one_batch(shapes)
         inverse = self.inverse.to(device)
         return _joined(sides[0])[..., inverse], _joined(sides[1])[..., inverse]
@@ -137,7 +154,7 @@ class FeasibleSet:
         """
         return _joined(
             [
-                owner.prox(self._group(x, at, shape), self._scale(gamma, at, shape)).flatten(-2)
+                _flat(owner.prox(self._group(x, at, shape), self._scale(gamma, at, shape)))
                 for owner, at, shape in self._slices
             ]
         )
@@ -179,7 +196,16 @@ class FeasibleSet:
         return out
 
     def check_values(self) -> None:
-        """Raise ValueError where the parameters of a set, as they are now, do not describe one."""
+        """Raise ValueError where the parameters of a set, as they are now, do not describe one.
+
+        Raises:
+            NotImplementedError: `vmap` maps one of them.
+        """
+        if any(map(is_mapped, self.tensors)):
+            raise NotImplementedError(
+                "vmap over the parameters of a set is for layers whose sets are all boxes: give the parameters (a "
+                "radius, a bound, ...) a leading batch dimension, which is solved as one batch."
+            )
         for owner, _ in self.parts:
             owner.check_values()
 
@@ -192,7 +218,7 @@ class FeasibleSet:
         for owner, at, shape in self._slices:
             group = self._group(small, at, shape)
             group = group if owner.separable else group.all(-1, keepdim=True).expand_as(group)
-            out.append((group & ~owner.is_point(self._group(x, at, shape))).flatten(-2))
+            out.append(_flat(group & ~owner.is_point(self._group(x, at, shape))))
         return _joined(out)
 
     def touching(self, v: Tensor, weak: Tensor, reach: float) -> Tensor:
@@ -221,7 +247,7 @@ class FeasibleSet:
         out = []
         for (owner, at, shape), D in zip(self._slices, blocks, strict=True):
             group = self._group(x, at, shape)
-            out.append((D * group if owner.separable else (D @ group[..., None])[..., 0]).flatten(-2))
+            out.append(_flat(D * group if owner.separable else (D @ group[..., None])[..., 0]))
         return _joined(out)
 
     def outer(self, x: Tensor, y: Tensor, blocks: Blocks) -> Blocks:
@@ -237,7 +263,7 @@ class FeasibleSet:
         values, vectors = [], []
         for (owner, _, _), D in zip(self._slices, blocks, strict=True):
             value, vector = (D, torch.ones_like(D)) if owner.separable else torch.linalg.eigh(D)
-            values.append(value.flatten(-2))
+            values.append(_flat(value))
             vectors.append(vector)
         return _joined(values).clamp(0.0, 1.0), vectors
 
@@ -267,11 +293,11 @@ class FeasibleSet:
     @staticmethod
     def _scale(gamma: Tensor | float, at: slice, shape: tuple[int, ...]) -> Tensor | float:
         """Return gamma of each group, `(..., groups, 1)`."""
-        return gamma if isinstance(gamma, float) else gamma[..., at].unflatten(-1, shape)[..., :1]
+        return gamma if isinstance(gamma, float) else FeasibleSet._group(gamma, at, shape)[..., :1]
 
     @staticmethod
     def _group(x: Tensor, at: slice, shape: tuple[int, ...]) -> Tensor:
-        return x[..., at].unflatten(-1, shape)
+        return x[..., at].reshape(*x.shape[:-1], *shape)
 
 
 def outline(owner: ConvexSet) -> Any:
@@ -299,11 +325,15 @@ def _snapshot(module: nn.Module) -> nn.Module:
     return copy
 
 
-def _tensors_of(module: nn.Module) -> Iterator[Tensor]:
-    """Yield the tensors that a module and its children hold, as parameters, buffers or attributes."""
-    for part in module.modules():
-        for holder in (part._parameters, part._buffers, part.__dict__):
-            yield from (x for x in holder.values() if isinstance(x, Tensor))
+def _flat(x: Tensor) -> Tensor:
+    """Return `(..., groups size)`; not by `flatten`, for which the older `vmap` has no rule, nor for `unflatten`."""
+    return x.reshape(*x.shape[:-2], x.shape[-2] * x.shape[-1])
+
+
+def _places_of(module: nn.Module) -> list[tuple[dict[str, Any], str]]:
+    """Return where a module and its children hold tensors, as parameters, buffers or attributes."""
+    holders = (holder for part in module.modules() for holder in (part._parameters, part._buffers, part.__dict__))
+    return [(holder, name) for holder in holders for name, value in holder.items() if isinstance(value, Tensor)]
 
 
 def _joined(parts: list[Tensor]) -> Tensor:

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import torch
 from torch import Tensor
+
+from ..transforms import is_mapped
 
 
 def as_bound(name: str, value: Any) -> Tensor | float:
@@ -27,6 +30,22 @@ def as_bound(name: str, value: Any) -> Tensor | float:
 def as_tensor(bound: Tensor | float) -> Tensor:
     """Return a number or tensor as a tensor, with its graph."""
     return bound if isinstance(bound, Tensor) else torch.tensor(bound, dtype=torch.float64)
+
+
+def check_order(lower: Tensor, upper: Tensor) -> None:
+    """Raise ValueError unless lower <= upper and a finite point lies between; what `vmap` maps cannot be looked at."""
+    try:
+        torch.broadcast_shapes(lower.shape, upper.shape)
+    except RuntimeError as error:
+        came = f"{tuple(lower.shape)} and {tuple(upper.shape)}"
+        raise ValueError(f"`lower` and `upper` must have shapes that broadcast, got {came}.") from error
+    if is_mapped(lower) or is_mapped(upper):
+        return
+    lower, upper = (bound.detach().double().cpu() for bound in (lower, upper))
+    if not bool((lower <= upper).all()):
+        raise ValueError("`lower` must be at most `upper` in every component, got crossed or NaN bounds.")
+    if bool((lower == math.inf).any()) or bool((upper == -math.inf).any()):
+        raise ValueError("`lower` must be below +infinity and `upper` above -infinity.")
 
 
 def short(bound: Tensor | float) -> str:

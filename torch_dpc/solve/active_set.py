@@ -51,16 +51,6 @@ def adjoint(G: Tensor, Ct: Tensor, active: Tensor, v_bar: Tensor, lam_bar: Tenso
     return v_bar + solve_active(G, Ct, active, rhs if lam_bar is None else rhs + lam_bar)[0]
 
 
-def adjoint_dense(G: Tensor, active: Tensor, v_bar: Tensor, lam_bar: Tensor | None) -> Tensor:
-    """Return what `adjoint` does in plain operations on all rows, slower; the active rows must be independent."""
-    held = active.to(G.dtype)
-    matrix = held[..., :, None] * G * held[..., None, :] + torch.diag_embed(1 - held)
-    rhs = -times(G, v_bar)
-    rhs = held * (rhs if lam_bar is None else rhs + lam_bar)
-    # Not `linalg.solve`: torch's batched LU is unsound on several threads (its issue 141358), Cholesky is not.
-    return v_bar + torch.cholesky_solve(rhs[..., None], torch.linalg.cholesky(matrix))[..., 0]
-
-
 def _packed(G: Tensor, active: Tensor, rhs: Tensor) -> tuple[Tensor, Tensor]:
     """Solve all samples by one batched Cholesky, padded to the longest list."""
     n = rhs.shape[1]

@@ -14,6 +14,7 @@ from ..linear import lead_all, times
 from ..problem.compact_form import Sizes
 from ..problem.reduction import Reduction
 from ..sets.feasible import FeasibleSet
+from ..transforms import refuse_forward_twice, untransformed
 from .infeasibility import separates_from_set
 from .optimality import BATCHED, WEAKLY_ACTIVE, Optimality
 from .projected_system import Implicit, solve_system
@@ -45,7 +46,8 @@ class ConvexSolver:
     @cached_property
     def gamma(self) -> Tensor:
         """The scale of the multipliers, `(N,)`."""
-        return scale_of(self._G, self.sets)
+        with untransformed():  # the first call may be within a transform, the next one outside of it
+            return scale_of(self._G, self.sets)
 
     @cached_property
     def _G(self) -> Tensor:
@@ -76,6 +78,8 @@ class ConvexSolver:
             InfeasibleError, SolveError: with `on_failure="raise"`, if a sample has no accepted solution.
         """
         self.sets.check_values()
+        if not self.sets.is_piecewise_affine:
+            refuse_forward_twice()
         # As they are now: the backward must not see what the sets become later.
         sets, gamma = self.sets.snapshot(), self.gamma
         order, inverse = sets.order.to(theta.device), sets.inverse.to(theta.device)
@@ -86,7 +90,7 @@ class ConvexSolver:
         v0 = times(reduction.rows.C, times(reduction.A_theta, theta))[..., order]
         G = reduction.G[..., order[:, None], order]
         projected = sets.prox(v + gamma * lam, gamma)
-        v, lam = Implicit.apply(v0, G, projected, v, lam, solved, weak, sets, gamma)
+        v, lam = Implicit.apply(v0, G, projected, v, lam, solved, weak, sets, gamma, *sets.tensors)
         v, lam, active = (x[..., inverse] for x in (v, lam, active))
         return Planned(*self.sizes.split(v), lam, active, info)
 

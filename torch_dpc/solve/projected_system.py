@@ -21,8 +21,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..linear import lead_all, outer, times
+from ..linear import lead_all, outer, times, unit_vectors
 from ..sets.feasible import Blocks, FeasibleSet
+from ..transforms import is_grads_batched
 
 #: Directions whose eigenvalue of D is within this of 1 are free.
 FREE = 1e-12
@@ -46,7 +47,6 @@ def solve_system(
     """
     d, vectors = sets.spectral(blocks)
     b = sets.rotate(vectors, rhs)
-    d = d.expand_as(b)
     held = d < 1 - FREE
     rows = held.reshape(-1, held.shape[-1]).any(0).nonzero()[:, 0]
     turned = sets.rotate_matrix(vectors, G)
@@ -56,6 +56,7 @@ def solve_system(
     on = held[..., rows]
     lack = torch.where(on, 1 - d[..., rows], 1.0)
     curvature = torch.where(on, gamma[rows] * d[..., rows] / lack, 1.0)
+    # D has the dimensions of the samples; those that rhs has before them are many right-hand sides of one system.
     matrix = turned[..., rows[:, None], rows] * (on[..., :, None] & on[..., None, :]) + torch.diag_embed(curvature)
     right = b[..., rows] if transposed else b[..., rows] / lack - times(turned[..., rows, :], free)
     y, regular = _symmetric_solve(matrix, torch.where(on, right, 0.0))
@@ -71,19 +72,25 @@ def solve_system(
 
 
 def _symmetric_solve(matrix: Tensor, rhs: Tensor) -> tuple[Tensor, Tensor]:
-    """Solve positive semidefinite systems `(..., k, k)`; say which were nonsingular, `(...)`."""
+    """Solve positive semidefinite systems `(..., k, k)`; say which were nonsingular, `(...)`.
+
+    Dimensions that rhs `(..., k)` has before those of the matrices are many right-hand sides of each.
+    """
     batch, k = rhs.shape[:-1], rhs.shape[-1]
-    flat, right = matrix.expand(*batch, k, k).reshape(-1, k, k), rhs.reshape(-1, k)
-    scale = flat.diagonal(dim1=-2, dim2=-1).clamp_min(torch.finfo(flat.dtype).tiny).rsqrt()
-    unit = flat * scale[:, :, None] * scale[:, None, :]
+    own = batch[len(batch) - (matrix.ndim - 2) :]
+    flat = matrix.expand(*own, k, k).reshape(-1, k, k)
+    many = batch[: len(batch) - len(own)].numel()
+    right = rhs.reshape(many, len(flat), k).permute(1, 2, 0)  # (systems, k, right-hand sides)
+    scale = flat.diagonal(dim1=-2, dim2=-1).clamp_min(torch.finfo(flat.dtype).tiny).rsqrt()[..., None]
+    unit = flat * scale * scale.mT
     L, info = torch.linalg.cholesky_ex(unit)
-    y = torch.cholesky_solve((right * scale)[..., None], L)[..., 0] * scale
+    y = torch.cholesky_solve(right * scale, L) * scale
     regular = (info == 0) & (L.diagonal(dim1=-2, dim2=-1).square().amin(-1) > TRUSTED)
     bad = (~regular).nonzero()[:, 0]
     if len(bad):
         inverse = torch.linalg.pinv(unit[bad], hermitian=True, rtol=DEPENDENT)
-        y[bad] = times(inverse, right[bad] * scale[bad]) * scale[bad]
-    return y.reshape(*batch, k), regular.reshape(batch)
+        y[bad] = inverse @ (right[bad] * scale[bad]) * scale[bad]
+    return y.permute(2, 0, 1).reshape(*batch, k), regular.reshape(own).expand(batch)
 
 
 class SolveSystem(torch.autograd.Function):
@@ -107,7 +114,7 @@ class SolveSystem(torch.autograd.Function):
     def backward(ctx: Any, x_bar: Tensor) -> tuple[Tensor | None, ...]:
         x, G, *blocks = ctx.saved_tensors
         sets, gamma = ctx.sets, ctx.gamma
-        s = SolveSystem.apply(x_bar, G, sets, gamma, not ctx.transposed, *blocks)
+        s = _solve(x_bar, G, sets, gamma, not ctx.transposed, blocks)
         left, right = (x, s) if ctx.transposed else (s, x)  # K_bar = -left right'
         G_bar = outer(sets.apply(blocks, left) - left, right, G) if ctx.needs_input_grad[1] else None
         D_bar: Blocks = [None] * len(blocks)  # type: ignore[list-item]
@@ -130,7 +137,7 @@ class SolveSystem(torch.autograd.Function):
                 change = change - (gamma * moved - times(G, moved))
             else:
                 change = change - sets.apply(D_t, gamma * x - times(G, x))
-        return SolveSystem.apply(change, G, sets, gamma, transposed, *blocks)
+        return _solve(change, G, sets, gamma, transposed, blocks)
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Tensor, int]:
@@ -141,9 +148,18 @@ class SolveSystem(torch.autograd.Function):
         return SolveSystem.apply(rhs, G, sets, gamma, transposed, *blocks), 0
 
 
-class Implicit(torch.autograd.Function):
-    """(v0, G, projected, v, lam, solved, weak, sets, gamma) -> v, lam at a solution found elsewhere.
+def _solve(rhs: Tensor, G: Tensor, sets: FeasibleSet, gamma: Tensor, transposed: bool, blocks: Blocks) -> Tensor:
+    """Return what `SolveSystem` does, also for the many right-hand sides of the older `vmap`: by the inverse."""
+    if not is_grads_batched(rhs):
+        return SolveSystem.apply(rhs, G, sets, gamma, transposed, *blocks)
+    columns = SolveSystem.apply(unit_vectors(rhs), G, sets, gamma, transposed, *blocks)
+    return times(columns.movedim(0, -1), rhs)
 
+
+class Implicit(torch.autograd.Function):
+    """(v0, G, projected, v, lam, solved, weak, sets, gamma, *sets.tensors) -> v, lam at a solution found elsewhere.
+
+    The tensors of the sets are named, so that transforms know of them: D depends on them.
     `projected` is P(v + gamma lam) at the constant v + gamma lam: it carries the derivative of the set's parameters.
     A cotangent (v_bar, lam_bar) goes back by  w = K'^-1 (lam_bar - G v_bar):
 
@@ -153,64 +169,63 @@ class Implicit(torch.autograd.Function):
     @staticmethod
     def forward(
         v0: Tensor, G: Tensor, projected: Tensor, v: Tensor, lam: Tensor, solved: Tensor, weak: Tensor,
-        sets: FeasibleSet, gamma: Tensor,
+        sets: FeasibleSet, gamma: Tensor, *of_sets: Tensor,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         return torch.where(solved, v, torch.nan), lam.clone()
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
-        _, G, _, _, _, solved, weak, ctx.sets, ctx.gamma = inputs
+        _, G, _, _, _, solved, weak, ctx.sets, ctx.gamma, *of_sets = inputs
         ctx.versions = ctx.sets.versions()
         ctx.set_materialize_grads(False)
-        ctx.save_for_backward(*output, G, solved, weak)
-        ctx.save_for_forward(*output, G, solved, weak)
+        ctx.save_for_backward(*output, G, solved, weak, *of_sets)
+        ctx.save_for_forward(*output, G, solved, weak, *of_sets)
 
     @staticmethod
-    def _blocks(ctx: Any, v: Tensor, lam: Tensor, solved: Tensor, weak: Tensor) -> Blocks:
-        sets = ctx.sets
-        if sets.versions() != ctx.versions:
+    def _saved(ctx: Any) -> tuple[Tensor, Tensor, Tensor, Blocks]:
+        """Return lam, G, which samples have a solution, and D there."""
+        if ctx.sets.versions() != ctx.versions:
             raise RuntimeError(
                 "a parameter of a set (a bound, a radius, ...) was changed in place between the plan and its "
                 "derivative: take the derivative first."
             )
+        v, lam, G, solved, weak, *of_sets = ctx.saved_tensors
+        sets = ctx.sets.with_tensors(of_sets)
         x = torch.where(solved, v, 0.0) + ctx.gamma * lam
-        return sets.freed(sets.jacobians(x, ctx.gamma), weak)
+        return lam, G, solved, sets.freed(sets.jacobians(x, ctx.gamma), weak)
 
     @staticmethod
     def backward(ctx: Any, v_bar: Tensor | None, lam_bar: Tensor | None) -> tuple[Tensor | None, ...]:
-        v, lam, G, solved, weak = ctx.saved_tensors
         if v_bar is None and lam_bar is None:
-            return (None,) * 9
-        blocks = Implicit._blocks(ctx, v, lam, solved, weak)
+            return (None,) * len(ctx.needs_input_grad)
+        lam, G, solved, blocks = Implicit._saved(ctx)
         # Samples without a solution add nothing, whatever came back for their NaN.
         v_bar = torch.zeros_like(lam) if v_bar is None else torch.where(solved, v_bar, 0.0)
         rhs = -times(G, v_bar)
         rhs = rhs if lam_bar is None else rhs + torch.where(solved, lam_bar, 0.0)
-        w = SolveSystem.apply(rhs, G, ctx.sets, ctx.gamma, True, *blocks)
+        w = _solve(rhs, G, ctx.sets, ctx.gamma, True, blocks)
         v0_bar = v_bar + w - ctx.sets.apply(blocks, w)
         G_bar = outer(-v0_bar, lam, G) if ctx.needs_input_grad[1] else None
-        return v0_bar, G_bar, -w, None, None, None, None, None, None
+        return v0_bar, G_bar, -w, *(None,) * (len(ctx.needs_input_grad) - 3)
 
     @staticmethod
     def jvp(
         ctx: Any, v0_t: Tensor | None, G_t: Tensor | None, projected_t: Tensor | None, *_: Any
     ) -> tuple[Tensor, Tensor]:
-        v, lam, G, solved, weak = ctx.saved_tensors
-        blocks = Implicit._blocks(ctx, v, lam, solved, weak)
+        lam, G, solved, blocks = Implicit._saved(ctx)
         free = torch.zeros_like(lam) if v0_t is None else v0_t
         if G_t is not None:
             free = free - times(G_t, lam)
         rhs = free - ctx.sets.apply(blocks, free)
         if projected_t is not None:
             rhs = rhs - projected_t
-        lam_t = SolveSystem.apply(torch.where(solved, rhs, 0.0), G, ctx.sets, ctx.gamma, False, *blocks)
+        lam_t = _solve(torch.where(solved, rhs, 0.0), G, ctx.sets, ctx.gamma, False, blocks)
         return torch.where(solved, free - times(G, lam_t), 0.0), lam_t
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        *tensors, sets, gamma = args
-        lifted = lead_all(tuple(tensors), in_dims[:7], (1, 2, 1, 1, 1, 1, 1), info.batch_size)
-        outputs = Implicit.apply(*lifted, sets, gamma)
+        lifted = lead_all(args[:7], in_dims[:7], (1, 2, 1, 1, 1, 1, 1), info.batch_size)
+        outputs = Implicit.apply(*lifted, *args[7:])
         return outputs, (0,) * len(outputs)
 
 
