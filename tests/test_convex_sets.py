@@ -290,6 +290,33 @@ def test_the_hyper_gradient_of_a_gradient():
     assert relative(radius.grad, difference) < DIFFERENCES
 
 
+SECOND = {k: PARAMETERS[k] for k in ("a radius", "the radius of a trajectory", "a center", "a price")}
+
+
+@pytest.mark.parametrize("which", SECOND)
+def test_second_derivatives_over_a_set_know_that_the_plan_moves(which):
+    make, value = SECOND[which]
+    value, (u_ini, y_ini) = value.double(), inputs()
+
+    def cost(x, y=y_ini):
+        sol = dpc.DPCLayer(small_data(), **{**SMALL, **make(x)})(u_ini, y, y_ref=Y_REF)
+        return (sol.u**3).sum() + (sol.lam**2).sum()
+
+    def first(x, y=y_ini):
+        with torch.enable_grad():
+            x = x.detach().clone().requires_grad_()
+            return torch.autograd.grad(cost(x, y), x)[0]
+
+    expected = central(first, value, 1e-6)
+    x, y = value.clone().requires_grad_(), y_ini.clone().requires_grad_()
+    (gradient,) = torch.autograd.grad(cost(x, y), x, create_graph=True)
+    rows = [torch.autograd.grad(g, x, retain_graph=True)[0] for g in gradient.reshape(-1)]
+    assert relative(torch.stack(rows).reshape(expected.shape), expected) < DIFFERENCES
+    assert relative(hessian(cost)(value), expected) < DIFFERENCES
+    (mixed,) = torch.autograd.grad(gradient.sum(), y)
+    assert relative(mixed, central(lambda y: first(value, y).sum(), y_ini, 1e-6)) < DIFFERENCES
+
+
 HARD = {
     "balls of inputs and outputs": {"u_set": dpc.Ball(0.8), "y_set": dpc.Ball(2.5)},
     "tight balls": {"u_set": dpc.Ball(0.2), "y_set": dpc.Box(-5.0, 5.0)},

@@ -89,8 +89,7 @@ class ConvexSolver:
         # The solution is known: what follows attaches its derivative.
         v0 = times(reduction.rows.C, times(reduction.A_theta, theta))[..., order]
         G = reduction.G[..., order[:, None], order]
-        projected = sets.prox(v + gamma * lam, gamma)
-        v, lam = Implicit.apply(v0, G, projected, v, lam, solved, weak, sets, gamma, *sets.tensors)
+        v, lam = Implicit.apply(v0, G, v, lam, solved, weak, sets, gamma, *sets.tensors)
         v, lam, active = (x[..., inverse] for x in (v, lam, active))
         return Planned(*self.sizes.split(v), lam, active, info)
 

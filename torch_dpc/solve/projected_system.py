@@ -16,6 +16,7 @@ is the active system of a box (kappa = 0) with the curvature of the set's bounda
 from __future__ import annotations
 
 import inspect
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -157,33 +158,34 @@ def _solve(rhs: Tensor, G: Tensor, sets: FeasibleSet, gamma: Tensor, transposed:
 
 
 class Implicit(torch.autograd.Function):
-    """(v0, G, projected, v, lam, solved, weak, sets, gamma, *sets.tensors) -> v, lam at a solution found elsewhere.
+    """(v0, G, v, lam, solved, weak, sets, gamma, *sets.tensors) -> v, lam at a solution found elsewhere.
 
-    The tensors of the sets are named, so that transforms know of them: D depends on them.
-    `projected` is P(v + gamma lam) at the constant v + gamma lam: it carries the derivative of the set's parameters.
     A cotangent (v_bar, lam_bar) goes back by  w = K'^-1 (lam_bar - G v_bar):
 
-        v0_bar = v_bar + (I - D) w,     projected_bar = -w,     G_bar = -v0_bar lam'.
+        v0_bar = v_bar + (I - D) w,     G_bar = -v0_bar lam',     set_bar = -(dP/dset)' w at x = v + gamma lam,
+
+    for the tensors that the sets are made of. All of it is computed from the outputs, which carry the graph that leads
+    here, so that a derivative of the derivative knows how x moves.
     """
 
     @staticmethod
     def forward(
-        v0: Tensor, G: Tensor, projected: Tensor, v: Tensor, lam: Tensor, solved: Tensor, weak: Tensor,
-        sets: FeasibleSet, gamma: Tensor, *of_sets: Tensor,
+        v0: Tensor, G: Tensor, v: Tensor, lam: Tensor, solved: Tensor, weak: Tensor, sets: FeasibleSet,
+        gamma: Tensor, *of_sets: Tensor,
     ) -> tuple[Tensor, Tensor]:  # fmt: skip
         return torch.where(solved, v, torch.nan), lam.clone()
 
     @staticmethod
     def setup_context(ctx: Any, inputs: tuple[Any, ...], output: tuple[Tensor, Tensor]) -> None:
-        _, G, _, _, _, solved, weak, ctx.sets, ctx.gamma, *of_sets = inputs
+        _, G, _, _, solved, weak, ctx.sets, ctx.gamma, *of_sets = inputs
         ctx.versions = ctx.sets.versions()
         ctx.set_materialize_grads(False)
         ctx.save_for_backward(*output, G, solved, weak, *of_sets)
         ctx.save_for_forward(*output, G, solved, weak, *of_sets)
 
     @staticmethod
-    def _saved(ctx: Any) -> tuple[Tensor, Tensor, Tensor, Blocks]:
-        """Return lam, G, which samples have a solution, and D there."""
+    def _saved(ctx: Any) -> tuple[Tensor, Tensor, Tensor, Tensor, list[Tensor], Blocks]:
+        """Return x, lam, G, which samples have a solution, the tensors of the sets, and D at x."""
         if ctx.sets.versions() != ctx.versions:
             raise RuntimeError(
                 "a parameter of a set (a bound, a radius, ...) was changed in place between the plan and its "
@@ -192,13 +194,18 @@ class Implicit(torch.autograd.Function):
         v, lam, G, solved, weak, *of_sets = ctx.saved_tensors
         sets = ctx.sets.with_tensors(of_sets)
         x = torch.where(solved, v, 0.0) + ctx.gamma * lam
-        return lam, G, solved, sets.freed(sets.jacobians(x, ctx.gamma), weak)
+        return x, lam, G, solved, of_sets, sets.freed(sets.jacobians(x, ctx.gamma), weak)
+
+    @staticmethod
+    def _project(ctx: Any, x: Tensor) -> Callable[..., Tensor]:
+        """Return the projection of x as a function of the tensors that the sets are made of."""
+        return lambda *of_sets: ctx.sets.with_tensors(of_sets).prox(x, ctx.gamma)
 
     @staticmethod
     def backward(ctx: Any, v_bar: Tensor | None, lam_bar: Tensor | None) -> tuple[Tensor | None, ...]:
         if v_bar is None and lam_bar is None:
             return (None,) * len(ctx.needs_input_grad)
-        lam, G, solved, blocks = Implicit._saved(ctx)
+        x, lam, G, solved, of_sets, blocks = Implicit._saved(ctx)
         # Samples without a solution add nothing, whatever came back for their NaN.
         v_bar = torch.zeros_like(lam) if v_bar is None else torch.where(solved, v_bar, 0.0)
         rhs = -times(G, v_bar)
@@ -206,27 +213,46 @@ class Implicit(torch.autograd.Function):
         w = _solve(rhs, G, ctx.sets, ctx.gamma, True, blocks)
         v0_bar = v_bar + w - ctx.sets.apply(blocks, w)
         G_bar = outer(-v0_bar, lam, G) if ctx.needs_input_grad[1] else None
-        return v0_bar, G_bar, -w, *(None,) * (len(ctx.needs_input_grad) - 3)
+        of_sets_bar: tuple[Tensor | None, ...] = (None,) * len(of_sets)
+        if any(ctx.needs_input_grad[SET_TENSORS:]):
+            of_sets_bar = _pull(Implicit._project(ctx, x), of_sets, -w)
+        return v0_bar, G_bar, *(None,) * (SET_TENSORS - 2), *of_sets_bar
 
     @staticmethod
-    def jvp(
-        ctx: Any, v0_t: Tensor | None, G_t: Tensor | None, projected_t: Tensor | None, *_: Any
-    ) -> tuple[Tensor, Tensor]:
-        lam, G, solved, blocks = Implicit._saved(ctx)
+    def jvp(ctx: Any, v0_t: Tensor | None, G_t: Tensor | None, *rest: Any) -> tuple[Tensor, Tensor]:
+        x, lam, G, solved, of_sets, blocks = Implicit._saved(ctx)
         free = torch.zeros_like(lam) if v0_t is None else v0_t
         if G_t is not None:
             free = free - times(G_t, lam)
         rhs = free - ctx.sets.apply(blocks, free)
-        if projected_t is not None:
-            rhs = rhs - projected_t
+        of_sets_t = rest[SET_TENSORS - 2 :]
+        if any(t is not None for t in of_sets_t):
+            tangents = tuple(torch.zeros_like(s) if t is None else t for s, t in zip(of_sets, of_sets_t, strict=True))
+            rhs = rhs - torch.func.jvp(Implicit._project(ctx, x), tuple(of_sets), tangents)[1]
         lam_t = _solve(torch.where(solved, rhs, 0.0), G, ctx.sets, ctx.gamma, False, blocks)
         return torch.where(solved, free - times(G, lam_t), 0.0), lam_t
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
-        lifted = lead_all(args[:7], in_dims[:7], (1, 2, 1, 1, 1, 1, 1), info.batch_size)
-        outputs = Implicit.apply(*lifted, *args[7:])
+        lifted = lead_all(args[:6], in_dims[:6], (1, 2, 1, 1, 1, 1), info.batch_size)
+        outputs = Implicit.apply(*lifted, *args[6:])
         return outputs, (0,) * len(outputs)
+
+
+#: Where among the arguments of `Implicit` the tensors of the sets begin.
+SET_TENSORS = 8
+
+
+def _pull(function: Callable[..., Tensor], at: list[Tensor], cotangent: Tensor) -> tuple[Tensor | None, ...]:
+    """Return the cotangents of a function's arguments; also for the many cotangents of the older `vmap`."""
+    if not is_grads_batched(cotangent):
+        bars: tuple[Tensor, ...] = torch.func.vjp(function, *at)[1](cotangent)
+        return bars
+    with torch.enable_grad():
+        # Views: one tensor may have been made of another, and what reaches it is not to be counted twice.
+        arguments = [x.view_as(x) if x.requires_grad else x.detach().requires_grad_() for x in at]
+        value = function(*arguments)
+    return torch.autograd.grad(value, arguments, cotangent, allow_unused=True)
 
 
 # `apply` binds its arguments by the signature of `forward` at every call; finding it anew each time costs 15 us.
