@@ -284,7 +284,7 @@ def test_an_update_at_the_quadrotor_size_is_quick():
         stream.append(u[k], y[k])
         stream.data  # noqa: B018  the fold happens here
         times.append(time.perf_counter() - began)
-    # The least of some medians: where other processes have used up the machine's share, all calls of a while stand still.
+    # The least of some medians: where other processes use up the machine, all calls of a while stand still.
     assert min(np.median(part) for part in np.split(np.array(times), 10)) < 5e-3
 
 
