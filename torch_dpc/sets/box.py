@@ -36,7 +36,7 @@ class Box(ConvexSet):
         super().__init__(per)
         self.lower = as_bound("lower", lower)
         self.upper = as_bound("upper", upper)
-        self.check_bounds()
+        self.check_values()
 
     def bounds(self, like: Tensor) -> tuple[Tensor, Tensor]:
         """Return lower and upper as tensors of the dtype and on the device of another; graphs are kept."""
@@ -58,14 +58,11 @@ class Box(ConvexSet):
                     f"(*batch, {steps}, {channels}), got {tuple(bound.shape)}."  # type: ignore[union-attr]
                 )
 
-    def check_values(self) -> None:
-        self.check_bounds()
-
     def is_point(self, x: Tensor) -> Tensor:
         lower, upper = self.bounds(x)
         return (lower == upper).expand_as(x)
 
-    def check_bounds(self) -> None:
+    def check_values(self) -> None:
         """Raise ValueError unless lower <= upper with a finite point between; the solve tells of what `vmap` maps."""
         check_order(as_tensor(self.lower), as_tensor(self.upper))
 
@@ -163,7 +160,7 @@ class SoftBox(ConvexSet):
         self.check_values()
 
     def check_values(self) -> None:
-        self.box.check_bounds()
+        self.box.check_values()
         # NaN is not positive either.
         if not is_mapped(self.weight) and not bool((as_tensor(self.weight).detach() > 0).all()):
             raise ValueError("`weight` must be positive: without a price there is no bound.")

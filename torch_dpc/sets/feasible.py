@@ -134,7 +134,7 @@ class FeasibleSet:
         shapes: list[tuple[str, torch.Size]] = []
         for (owner, places), name in zip(self.parts, self.names, strict=True):
             assert isinstance(owner, Box)
-            owner.check_bounds()
+            owner.check_values()
             for side, value in zip(sides, owner.bounds(like), strict=True):
                 try:
                     full = torch.broadcast_to(value, (*value.shape[:-2], *places.shape))

@@ -111,26 +111,21 @@ class ConvexSolver:
         return tuple(found)
 
     def _solve(self, theta: Tensor) -> tuple[Tensor, ...]:
-        sets, gamma, order = self.sets, self.gamma, self.sets.order.to(theta.device)
+        sets, gamma = self.sets, self.gamma
+        order, inverse = sets.order.to(theta.device), sets.inverse.to(theta.device)
         a0, v0 = self._optimality.unconstrained(theta)
         found = solve_convex(self._G, self._Ct, self._resolvent, v0[..., order], sets, gamma)
         lam = found.lam
-        a = a0 - times(self.reduction.A_lam, lam[..., sets.inverse.to(theta.device)])
+        a = a0 - times(self.reduction.A_lam, lam[..., inverse])
         raw = times(self.reduction.rows.C, a)
         v = sets.prox(raw[..., order] + lam)
-        residual = self._optimality.residual(
-            theta, a, a0, raw, v[..., sets.inverse.to(theta.device)], v0, lam[..., sets.inverse.to(theta.device)]
-        )
-        # A multiplier that moves nothing holds nothing: its rows count as inactive, as at a box.
-        reach = WEAKLY_ACTIVE
-        small = (lam * self._G.diagonal(dim1=-2, dim2=-1)).abs() <= reach * (1 + v.abs())
-        blocks = sets.jacobians(v + gamma * lam, gamma)
-        weak = sets.weak(v, small)
-        d, vectors = sets.spectral(sets.freed(blocks, weak))
+        residual = self._optimality.residual(theta, a, a0, raw, v[..., inverse], v0, lam[..., inverse])
+        weak = self._weak(v, lam)
+        d, _ = sets.spectral(sets.freed(sets.jacobians(v + gamma * lam, gamma), weak))
         active = (d < HELD).expand_as(v)
         failed = ~(residual <= ACCEPTED) | self.reduction.rows.unreachable(theta)
         status = torch.where(failed, int(Status.FAILED), int(Status.SOLVED))
-        info = [status, found.iterations, residual, active.sum(-1), sets.touching(v, weak, reach)]
+        info = [status, found.iterations, residual, active.sum(-1), sets.touching(v, weak, WEAKLY_ACTIVE)]
         out = [v, lam, weak.expand_as(v), active, torch.stack([i.double().expand(status.shape) for i in info], dim=-1)]
         if bool(failed.any()):
             self._mark_failures(theta, v0[..., order], found.gap, failed, out)

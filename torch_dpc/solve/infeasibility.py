@@ -14,6 +14,8 @@ from .dual_active_set import SOLVED_FLAG, Daqp
 DEPENDENT = 1e-10
 #: Entries of a direction below this fraction of its largest are rounding, and rounds of leaving those out.
 NOTHING, ROUNDS = 1e-12, 10
+#: Rounds that make a direction of the gap between trajectories and sets.
+ALTERNATIONS = 60
 #: By how much the certificate must separate, relative to the size of v0 and of the bounds.
 MARGIN = 1e-9
 #: A certificate whose Ct'd is not quite zero excludes only |x| below this, relative to the size of the problem.
@@ -77,10 +79,6 @@ def _separates(d: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) 
     leak = norm(Ct.T @ d)
     # x with |x| > margin / leak are not excluded: demand that they be absurdly far away.
     return bool(margin > MARGIN * size) and bool(margin > FAR * (1 + size) * leak)
-
-
-#: Rounds that make a direction of a gap.
-ALTERNATIONS = 60
 
 
 def separates_from_set(Ct: Tensor, v0: Tensor, sets: FeasibleSet, gap: Tensor) -> Tensor:
