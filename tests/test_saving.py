@@ -11,7 +11,7 @@ import torch
 
 import torch_dpc as dpc
 from helpers import HOLDING, PAPER, SMALL, Y_REF, masses_data, paper_layer, randn, small_data, small_layer, windows
-from torch_dpc.registry import known_sets
+from torch_dpc.sets.registry import known_sets
 
 safetensors = pytest.importorskip("safetensors.torch", reason="saving needs safetensors")
 
@@ -198,7 +198,7 @@ class Shy(dpc.Box):
 
 @pytest.fixture
 def registry(monkeypatch):
-    from torch_dpc import registry
+    from torch_dpc.sets import registry
 
     monkeypatch.setattr(registry, "_registered", {})
 
@@ -217,7 +217,7 @@ def test_a_set_of_ones_own(tmp_path, registry):
 def test_a_set_that_is_not_known_where_it_is_loaded(tmp_path, registry, monkeypatch):
     dpc.register_set(Tube)
     small_layer(u_set=Tube(dpc.Box(-1.0, 1.0), [])).save(tmp_path / "layer")
-    monkeypatch.setattr("torch_dpc.registry._registered", {})
+    monkeypatch.setattr("torch_dpc.sets.registry._registered", {})
     with pytest.raises(ValueError, match="holds a set 'Tube' that is not known: call torch_dpc.register_set"):
         dpc.DPCLayer.load(tmp_path / "layer")
 

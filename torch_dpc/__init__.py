@@ -1,7 +1,8 @@
 """Differentiable data-driven predictive control for PyTorch, and attacks on it."""
 
 from . import attacks, systems, tuning
-from .controller import DPCController
+from .control.controller import DPCController
+from .control.simulation import ClosedLoopLog, Plant, collect, simulate
 from .data.hankel import HankelData, excitation_order, hankel
 from .data.hankel_batch import HankelBatch
 from .data.stream import HankelStream
@@ -10,7 +11,6 @@ from .layer import DPCLayer
 from .problem.compact_form import CompactForm
 from .saving import register_set
 from .sets import Ball, Box, ConvexSet, NonNegative, Product, Reals, SecondOrderCone, SoftBox
-from .simulation import ClosedLoopLog, Plant, collect, simulate
 from .solution import DPCSolution, SolveInfo
 
 __version__ = "0.1.0"

@@ -22,15 +22,15 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .autodiff import apply_function, carries_derivative, is_grads_batched, is_plain
+from .batching import flatten_batch, lead_all, outer, times, unit_vectors
 from .errors import Status
-from .linear import flatten_batch, lead_all, outer, times, unit_vectors
 from .problem.projected_kkt import FullAdjoint
 from .problem.reduction import Reduction
 from .sets.parameters import check_order
 from .solve import kernels
 from .solve.active_set import adjoint, solve_active
 from .solve.solver import Planned, Solver
-from .transforms import apply_function, carries_derivative, is_grads_batched, is_plain
 
 
 def solve_reduced(solver: Solver, theta: Tensor, reduction: Reduction, lower: Tensor, upper: Tensor) -> Planned:

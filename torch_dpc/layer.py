@@ -10,12 +10,13 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from .autodiff import carries_derivative, untransformed
+from .batching import times
 from .checks import one_batch, reference, window, with_one_batch
 from .data.hankel import HankelData
 from .data.hankel_batch import HankelBatch
 from .errors import Status
 from .function import solve_reduced
-from .linear import times
 from .problem.compact_form import CompactForm, Sizes, compact_form
 from .problem.projected_kkt import FullSystem
 from .problem.reduction import Reduction, reduce
@@ -28,7 +29,6 @@ from .settings import DOORS, Setup, check_choice, settings_of
 from .solution import DPCSolution, SolveInfo
 from .solve.convex_solve import ConvexSolver
 from .solve.solver import Planned, Solver
-from .transforms import carries_derivative, untransformed
 
 
 class DPCLayer(nn.Module):

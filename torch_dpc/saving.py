@@ -4,7 +4,7 @@ The header holds one JSON text: the format's version, the sizes of the data, and
 of numbers, strings, lists and sets, in which each tensor stands by its name in the file. By default the data are
 written compact (:meth:`torch_dpc.HankelData.compressed`), so that a file is small whatever the number of windows.
 
-A set is written as the arguments of its constructor; see :mod:`torch_dpc.registry`.
+A set is written as the arguments of its constructor; see :mod:`torch_dpc.sets.registry`.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from .data.hankel import HankelData
-from .data.rowspace import RowSpace
-from .registry import arguments_of, known_sets, register_set
+from .data.row_space import RowSpace
 from .sets import ConvexSet
+from .sets.registry import arguments_of, known_sets, register_set
 
 __all__ = ["load_layer", "register_set", "save_layer"]
 

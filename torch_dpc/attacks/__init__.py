@@ -1,12 +1,12 @@
 """Attacks on the measurements: costs, budgets, and how to choose a perturbation."""
 
+from ..data.predictor import Predictor
 from .budgets import Ball, Box, Budget, Ellipsoid, L1Ball, PerChannel, RelativeBall, SparseBall
 from .costs import Cost, TargetInput, TrackingError
 from .gradient import LinearizedAttack
 from .iterative import FrankWolfeAttack, ProjectedGradientAttack
 from .network import AttackPolicy
 from .policy import PolicyAttack
-from .predictor import Predictor
 from .query import FiniteDifferenceAttack, RandomSearchAttack
 from .random import RandomAttack
 

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from ..checks import as_data
 from ..data.hankel import HankelData
+from ..data.predictor import Predictor
 from ..problem.weights import weight_matrix
 from ..solution import DPCSolution
-from .predictor import Predictor
 from .references import last_rows, to_horizon
 
 #: A cost of a plan, `(*batch,)`; any callable will do.

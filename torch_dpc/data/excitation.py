@@ -9,7 +9,7 @@ from torch import Tensor
 
 from ..errors import ExcitationWarning
 from .recordings import hankel
-from .rowspace import relative_tolerance
+from .row_space import relative_tolerance
 
 
 def excitation_order(recordings: list[Tensor]) -> int:

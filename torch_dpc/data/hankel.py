@@ -19,7 +19,7 @@ from torch import Tensor
 from ..checks import check_count
 from .excitation import excitation_order, has_full_row_rank, warn_of_excitation
 from .recordings import as_recordings, hankel
-from .rowspace import RowSpace, relative_tolerance
+from .row_space import RowSpace, relative_tolerance
 
 __all__ = ["HankelData", "excitation_order", "hankel"]
 

@@ -19,7 +19,7 @@ from scipy.linalg import lapack
 from ..checks import as_data, check_count
 from .excitation import has_full_row_rank
 from .hankel import HankelData
-from .rowspace import relative_tolerance
+from .row_space import relative_tolerance
 
 #: Windows folded at once. 256 and more cost the same a window; the memory grows with them.
 BLOCK = 512

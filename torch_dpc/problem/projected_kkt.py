@@ -19,8 +19,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..batching import flatten_batch, lead_all
 from ..data.hankel import HankelData
-from ..linear import flatten_batch, lead_all
 from .compact_form import CompactForm, Sizes, compact_form
 from .weights import Weights
 

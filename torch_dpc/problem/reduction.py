@@ -26,7 +26,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..transforms import carries_derivative, constant, untransformed
+from ..autodiff import carries_derivative, constant, untransformed
 from .rows import DataRows
 from .saddle import Saddle, known_solution
 from .weights import Weights, psd_root

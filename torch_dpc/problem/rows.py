@@ -1,6 +1,6 @@
 """The rows of the problem in the coordinates of the data's own row space, where n_g is gone.
 
-With g = B a (:mod:`torch_dpc.data.rowspace`) the problem reads
+With g = B a (:mod:`torch_dpc.data.row_space`) the problem reads
 
     minimise over a   1/2 |v - v_ref|_W^2 + lambda_g |N a|^2 + sum over past rows of lambda |S a - s|^2
     subject to        Eq a = e,   v = C a in the product of the sets,
@@ -18,9 +18,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..autodiff import carries_derivative
+from ..batching import times
 from ..data.hankel import HankelData
-from ..linear import times
-from ..transforms import carries_derivative
 from .data_derivative import in_row_space
 
 #: How far u_ini may be from what the data can produce, relative to its norm.

@@ -18,8 +18,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..linear import lead_all
-from ..transforms import carries_derivative, constant, refuse_forward_twice
+from ..autodiff import carries_derivative, constant, refuse_forward_twice
+from ..batching import lead_all
 
 
 @dataclass(frozen=True, eq=False)

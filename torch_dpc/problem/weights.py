@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..transforms import is_mapped
+from ..autodiff import is_mapped
 
 #: Asymmetry of Q or R, relative to its largest entry, up to which it is rounding and is averaged away.
 ASYMMETRY = 1e-6

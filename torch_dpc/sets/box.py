@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..transforms import is_mapped
+from ..autodiff import is_mapped
 from .base import ConvexSet
 from .parameters import as_bound, as_tensor, check_order, short
 

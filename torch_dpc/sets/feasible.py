@@ -10,8 +10,8 @@ from typing import Any, cast
 import torch
 from torch import Tensor, nn
 
+from ..autodiff import is_mapped, is_plain
 from ..checks import one_batch
-from ..transforms import is_mapped, is_plain
 from .base import ConvexSet, Part
 from .box import Box, SoftBox
 from .product import Product

@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..transforms import is_mapped
+from ..autodiff import is_mapped
 
 
 def as_bound(name: str, value: Any) -> Tensor | float:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from ..linear import times
+from ..batching import times
 from . import kernels
 from .kernels import STANDING_OUT
 

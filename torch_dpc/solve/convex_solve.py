@@ -9,12 +9,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..autodiff import refuse_forward_twice, untransformed
+from ..batching import lead_all, times
 from ..errors import Status
-from ..linear import lead_all, times
 from ..problem.compact_form import Sizes
 from ..problem.reduction import Reduction
 from ..sets.feasible import FeasibleSet
-from ..transforms import refuse_forward_twice, untransformed
 from .infeasibility import separates_from_set
 from .optimality import BATCHED, WEAKLY_ACTIVE, Optimality
 from .projected_system import Implicit, solve_system

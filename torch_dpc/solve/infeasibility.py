@@ -6,7 +6,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ..linear import times
+from ..batching import times
 from ..sets.feasible import FeasibleSet
 from .dual_active_set import SOLVED_FLAG, Daqp
 

@@ -22,9 +22,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..linear import lead_all, outer, times, unit_vectors
+from ..autodiff import is_grads_batched
+from ..batching import lead_all, outer, times, unit_vectors
 from ..sets.feasible import Blocks, FeasibleSet
-from ..transforms import is_grads_batched
 
 #: Directions whose eigenvalue of D is within this of 1 are free.
 FREE = 1e-12

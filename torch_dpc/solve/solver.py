@@ -11,9 +11,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..batching import flatten_batch, times
 from ..checks import as_data, is_finite
 from ..errors import InfeasibleError, SolveError, Status
-from ..linear import flatten_batch, times
 from ..problem.compact_form import Sizes
 from ..problem.projected_kkt import FullSystem
 from ..problem.reduction import Reduction

@@ -20,7 +20,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from ..linear import times
+from ..batching import times
 from ..sets.feasible import FeasibleSet
 from .projected_system import solve_system
 

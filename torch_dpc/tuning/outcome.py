@@ -7,7 +7,7 @@ from typing import Any
 
 from torch import Tensor
 
-from ..attacks.predictor import Predictor as SubspacePredictor
+from ..data.predictor import Predictor as SubspacePredictor
 
 #: What inputs do from a window on: (u_ini, y_ini, u) -> y, all `(*batch, steps, n)`.
 Predictor = Callable[[Tensor, Tensor, Tensor], Tensor]

@@ -9,7 +9,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
-from .checks import as_data, check_count
+from ..checks import as_data, check_count
 from .controller import DPCController
 
 

@@ -16,7 +16,7 @@ from helpers import HOLDING, Y_REF, paper_layer, randn, relative, small_layer, w
 # diffcp copies tensors into NumPy arrays in a way that NumPy 2 warns of.
 pytestmark = pytest.mark.filterwarnings("ignore:__array__ implementation:DeprecationWarning")
 
-ROOT = Path(__file__).resolve().parent.parent
+ROOT = Path(__file__).resolve().parents[2]
 T_INI, HORIZON = 3, 6
 
 # What each peer reaches at the settings of PEERS on `gentle_layer`, solution and gradient, as the largest difference

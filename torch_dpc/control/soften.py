@@ -12,9 +12,9 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from .errors import SolveError, Status
-from .layer import DPCLayer
-from .solution import DPCSolution
+from ..errors import SolveError, Status
+from ..layer import DPCLayer
+from ..solution import DPCSolution
 
 #: Widths tried at once, and rounds of narrowing: t is found to (SECTIONS - 1)^-ROUNDS of its scale.
 SECTIONS = 16

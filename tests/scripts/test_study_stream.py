@@ -13,7 +13,7 @@ pytest.importorskip("matplotlib", reason="the scripts draw with matplotlib")
 pytest.importorskip("tqdm", reason="the scripts show their progress with tqdm")
 pytest.importorskip("safetensors", reason="saving needs safetensors")
 
-sys.path.insert(0, str(Path(__file__).resolve().parent.parent / "scripts"))
+sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 
 import _stream_adaptation as adaptation  # noqa: E402
 import study_stream  # noqa: E402

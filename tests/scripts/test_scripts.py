@@ -14,8 +14,8 @@ import torch_dpc as dpc
 pytest.importorskip("matplotlib", reason="the scripts draw with matplotlib")
 pytest.importorskip("tqdm", reason="the scripts show their progress with tqdm")
 
-SCRIPTS = Path(__file__).resolve().parent.parent / "scripts"
-sys.path[:0] = [str(SCRIPTS), str(Path(__file__).parent)]
+SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
+sys.path.insert(0, str(SCRIPTS))
 
 import _common as common  # noqa: E402
 import figure3_masses  # noqa: E402

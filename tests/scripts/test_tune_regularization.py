@@ -9,7 +9,7 @@ import torch
 for package in ("matplotlib", "tqdm", "joblib"):
     pytest.importorskip(package, reason=f"the script needs {package}: pip install '.[scripts]'")
 
-SCRIPTS = Path(__file__).resolve().parent.parent / "scripts"
+SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 sys.path.insert(0, str(SCRIPTS))
 
 import _tuning_report as report  # noqa: E402

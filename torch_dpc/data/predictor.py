@@ -8,7 +8,7 @@ import torch
 from torch import Tensor
 
 from ..checks import as_data
-from ..data.hankel import HankelData
+from .hankel import HankelData
 
 
 class Predictor:

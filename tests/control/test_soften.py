@@ -5,7 +5,7 @@ import torch
 
 import torch_dpc as dpc
 from helpers import PAPER, SMALL, Y_REF, masses_data, windows
-from torch_dpc.soften import plan_softened
+from torch_dpc.control.soften import plan_softened
 
 EXACT = 1e-6  # of the price, which is found by sections
 SAME = 1e-11  # a batch and a single call round differently

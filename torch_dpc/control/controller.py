@@ -7,9 +7,9 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .checks import as_index
-from .errors import Status
-from .layer import DPCLayer
+from ..checks import as_index
+from ..errors import Status
+from ..layer import DPCLayer
 from .soften import plan_softened
 
 
@@ -27,7 +27,7 @@ class DPCController:
             "raise": the layer's error;
             "hold": go on with the rest of the previous plan, its last input held beyond its end (before any plan: the
             input nearest to zero in the set);
-            "soften": widen the output bounds at the price `soft_weight` (:mod:`torch_dpc.soften`).
+            "soften": widen the output bounds at the price `soft_weight` (:mod:`torch_dpc.control.soften`).
         soft_weight: price of widening the output bounds by one unit, in units of the cost. Below it the plan is the one
             without softening, so it should exceed the sum of the output multipliers of ordinary plans.
 

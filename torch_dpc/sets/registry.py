@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 
 from torch import nn
 
-from .sets import ConvexSet
+from . import ConvexSet
 
 S = TypeVar("S", bound=type[ConvexSet])
 

@@ -14,7 +14,7 @@ import torch_dpc as dpc
 from helpers import HOLDING, Y_REF, generator, randn, relative, small_data, small_layer, windows
 from torch_dpc import attacks
 
-SCRIPTS = Path(__file__).resolve().parent.parent / "scripts"
+SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 sys.path.insert(0, str(SCRIPTS))
 
 INSIDE = 1e-9  # what every attack promises

@@ -12,7 +12,7 @@ import pytest
 for package in ("matplotlib", "tqdm", "joblib", "pyarrow"):
     pytest.importorskip(package, reason=f"campaigns need {package}: pip install '.[scripts,campaign]'")
 
-SCRIPTS = Path(__file__).resolve().parent.parent / "scripts"
+SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
 sys.path.insert(0, str(SCRIPTS))
 
 import pyarrow.parquet as pq  # noqa: E402

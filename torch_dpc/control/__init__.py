@@ -1,0 +1,1 @@
+"""The controller, its fallbacks, and the closed loop."""
