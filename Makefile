@@ -27,7 +27,7 @@ reproduce: $(ENV)  ## the paper's figures and tables, into results/
 
 test: $(ENV)  ## every test and docstring example (ARGS="-m 'not slow'" for the quick ones)
 	@ignore=; $(PY) -c 'import pybullet' 2>/dev/null || ignore=--ignore=torch_dpc/systems/quadrotor.py; \
-	set -x; $(PY) -m pytest tests --doctest-modules torch_dpc baselines $$ignore $(ARGS)
+	set -x; $(PY) -m pytest -n auto --dist worksteal tests --doctest-modules torch_dpc baselines $$ignore $(ARGS)
 
 bench: $(ENV)  ## time and error of the layer (ARGS=--quick for a short run)
 	$(PY) scripts/benchmark.py $(ARGS)
@@ -36,12 +36,13 @@ docs: .venv/.complete-docs  ## the documentation, into site/
 	$(PY) -m sphinx -q -W --keep-going docs site
 	@echo "Open site/index.html"
 
-lint: $(ENV)  ## ruff and mypy
+lint: $(ENV)  ## ruff, mypy and the direction of imports
 	$(PY) -m ruff check .
 	$(PY) -m mypy
+	@.venv/bin/lint-imports --no-logo
 
 clean:  ## remove what the other targets leave, but keep .venv
-	rm -rf results site build *.egg-info .pytest_cache .mypy_cache .ruff_cache
+	rm -rf results site build *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
 	find . -name .venv -prune -o -name __pycache__ -type d -exec rm -rf {} +
 
 distclean: clean  ## remove .venv and the compiled kernels too
