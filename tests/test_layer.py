@@ -140,7 +140,9 @@ def test_only_parameters_are_registered():
 
 @pytest.mark.parametrize("make", [small_layer, learning_layer])
 @pytest.mark.parametrize("solver", ["auto", "daqp", "newton"])
-@pytest.mark.parametrize("how", [copy.deepcopy, copy.copy, lambda layer: pickle.loads(pickle.dumps(layer))], ids=str)
+@pytest.mark.parametrize(
+    "how", [copy.deepcopy, copy.copy, lambda x: pickle.loads(pickle.dumps(x))], ids=["deepcopy", "copy", "pickle"]
+)
 def test_copies_answer_alike(make, solver, how):
     layer = make(solver=solver)
     u_ini, y_ini = one()
