@@ -2,7 +2,8 @@
 
 from . import attacks, systems, tuning
 from .control.controller import DPCController
-from .control.simulation import ClosedLoopLog, Plant, collect, simulate
+from .control.log import ClosedLoopLog
+from .control.simulation import simulate
 from .data.hankel import HankelData, excitation_order, hankel
 from .data.hankel_batch import HankelBatch
 from .data.stream import HankelStream
@@ -12,6 +13,7 @@ from .problem.compact_form import CompactForm
 from .saving import register_set
 from .sets import Ball, Box, ConvexSet, NonNegative, Product, Reals, SecondOrderCone, SoftBox
 from .solution import DPCSolution, SolveInfo
+from .systems.plant import Plant, collect
 
 __version__ = "0.1.0"
 

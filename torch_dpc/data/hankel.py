@@ -8,7 +8,8 @@ van Waarde, De Persis, Camlibel, Tesi 2020), so that no window runs across a sea
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import os
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
 from typing import Any
@@ -17,6 +18,7 @@ import torch
 from torch import Tensor
 
 from ..checks import check_count
+from .csv import Source, read_csv
 from .excitation import excitation_order, has_full_row_rank, warn_of_excitation
 from .recordings import as_recordings, hankel
 from .row_space import RowSpace, relative_tolerance
@@ -95,6 +97,41 @@ class HankelData:
             warn_of_excitation(order, depth, U.shape[1], n_u, stacklevel=2)
         cut_u, cut_y = t_ini * n_u, t_ini * n_y
         return cls(U[:cut_u], U[cut_u:], Y[:cut_y], Y[cut_y:], t_ini, horizon, n_u, n_y)
+
+    @classmethod
+    def from_csv(
+        cls,
+        path: Source | Sequence[Source],
+        *,
+        inputs: Sequence[str],
+        outputs: Sequence[str],
+        t_ini: int,
+        horizon: int,
+        delimiter: str = ",",
+    ) -> HankelData:
+        """Build the matrices from a CSV file, or from a list of files, each a recording of its own.
+
+        Args:
+            path: of a file whose first line names the columns, with one sample a line below, or a list of such.
+            inputs, outputs: names of the columns of u and y, in the order of the channels.
+            t_ini: steps that fix the initial condition.
+            horizon: steps that are planned.
+            delimiter: between columns.
+
+        Raises:
+            ValueError: a missing column, a line of another length, an entry that is no finite number (each with the
+                file and line), or a recording shorter than one window.
+            OSError: a file cannot be read.
+
+        Warns:
+            ExcitationWarning: the input is not persistently exciting of order t_ini + horizon.
+        """
+        paths = [path] if isinstance(path, (str, os.PathLike)) else list(path)
+        if not paths:
+            raise ValueError("`path` must be a file or a list of one file or more, got an empty list.")
+        recordings = [read_csv(one, inputs, outputs, delimiter=delimiter) for one in paths]
+        u, y = map(list, zip(*recordings, strict=True))
+        return cls.from_trajectories(u, y, t_ini=t_ini, horizon=horizon)
 
     @classmethod
     def from_stream(cls, chunks: Iterable[Any], *, t_ini: int, horizon: int) -> HankelData:
