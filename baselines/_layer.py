@@ -10,9 +10,9 @@ from torch import Tensor
 
 from torch_dpc import Box, DPCLayer, HankelData
 from torch_dpc.checks import is_finite
-from torch_dpc.problem.compact_form import Sizes, projector
+from torch_dpc.problem.compact_form import projector
 from torch_dpc.problem.reduction import Reduction
-from torch_dpc.problem.rows import Terms
+from torch_dpc.problem.terms import Sizes, Terms
 from torch_dpc.problem.weights import penalty, psd_root, weight_matrix
 
 #: Keeps 0 / 0 at 0.

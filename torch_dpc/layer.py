@@ -17,10 +17,11 @@ from .data.hankel import HankelData
 from .data.hankel_batch import HankelBatch
 from .errors import Status
 from .function import solve_reduced
-from .problem.compact_form import CompactForm, Sizes, compact_form
+from .problem.compact_form import CompactForm, compact_form
 from .problem.projected_kkt import FullSystem
 from .problem.reduction import Reduction, reduce
-from .problem.rows import DataRows, Terms
+from .problem.rows import DataRows
+from .problem.terms import Sizes, Terms
 from .problem.weights import Weights, penalty, weight_matrix
 from .saving import load_layer, save_layer
 from .sets import ConvexSet

@@ -21,7 +21,7 @@ from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
 from .data.hankel import HankelData
-from .data.row_space import RowSpace
+from .data.row_space import RowSpace, row_units
 from .sets import ConvexSet
 from .sets.registry import arguments_of, known_sets, register_set
 
@@ -107,7 +107,8 @@ def _data_from_tree(tree: Mapping[str, Any], reader: _Reader) -> HankelData:
         space = {name: tree["row_space"][name] for name in _SPACE_NUMBERS}
         if space["rank"] != columns:
             raise ValueError(f"the file is damaged: its data have {columns} columns for a rank of {space['rank']}.")
-        data.__dict__["row_space"] = RowSpace(basis=torch.eye(columns, dtype=torch.float64), **space)
+        units = row_units(data.matrices, data.n_u, data.n_y, data.n_windows)
+        data.__dict__["row_space"] = RowSpace(basis=torch.eye(columns, dtype=torch.float64), units=units, **space)
     return data
 
 

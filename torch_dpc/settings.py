@@ -13,8 +13,7 @@ from typing import Any
 from .checks import as_index
 from .data.hankel import HankelData
 from .data.hankel_batch import HankelBatch
-from .problem.compact_form import Sizes
-from .problem.rows import Terms
+from .problem.terms import Sizes, Terms
 from .sets import ConvexSet, Reals
 from .sets.feasible import FeasibleSet, outline
 

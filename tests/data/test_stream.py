@@ -11,7 +11,7 @@ import torch
 
 import torch_dpc as dpc
 from helpers import HOLDING, PAPER, SMALL, Y_REF, generator, randn, relative, windows
-from torch_dpc.data.stream import BLOCK
+from torch_dpc.data.window_factor import BLOCK
 from torch_dpc.problem.compact_form import projector
 
 #: Plans and gradients. On noise-free data the order of the windows alone moves gradients by 6e-10.

@@ -19,9 +19,10 @@ from torch import Tensor
 
 from ..checks import check_count
 from .csv import Source, read_csv
-from .excitation import excitation_order, has_full_row_rank, warn_of_excitation
+from .rank import excitation_order, has_full_row_rank, relative_tolerance, warn_of_excitation
 from .recordings import as_recordings, hankel
-from .row_space import RowSpace, relative_tolerance
+from .row_space import RowSpace
+from .window_factor import WindowFactor
 
 __all__ = ["HankelData", "excitation_order", "hankel"]
 
@@ -161,14 +162,23 @@ class HankelData:
             >>> HankelData.from_stream(recorder(), t_ini=2, horizon=5).n_windows
             144
         """
-        from .stream import HankelStream  # it makes HankelData itself
-
-        stream = HankelStream(t_ini=t_ini, horizon=horizon)
-        stream.extend(chunks)
-        data = stream.data
-        if (order := stream.excitation_order) < t_ini + horizon:
+        factor = WindowFactor(t_ini=t_ini, horizon=horizon)
+        factor.extend(chunks)
+        data = cls.from_factor(factor)
+        if (order := factor.excitation_order) < t_ini + horizon:
             warn_of_excitation(order, t_ini + horizon, data.n_windows, data.n_u, stacklevel=2)
         return data
+
+    @classmethod
+    def from_factor(cls, factor: WindowFactor) -> HankelData:
+        """Return the compact data of the windows in a triangular factor.
+
+        Raises:
+            ValueError: no window is complete yet.
+        """
+        Up, Yp, Uf, Yf = factor.factor()
+        sizes = factor.t_ini, factor.horizon, factor.n_u, factor.n_y
+        return cls(Up, Uf, Yp, Yf, *sizes, windows_seen=factor.n_windows, recorded_as=factor.recorded_as)
 
     @property
     def n_g(self) -> int:
@@ -231,9 +241,11 @@ class HankelData:
 
     @cached_property
     def row_space(self) -> RowSpace:
-        """The factorisation of the stacked data, made once; see :class:`torch_dpc.data.rowspace.RowSpace`."""
+        """The factorisation of the stacked data, made once; see :class:`torch_dpc.data.row_space.RowSpace`."""
         with torch.inference_mode(False), torch.no_grad():
-            return RowSpace.of(self)
+            return RowSpace.of(
+                self.matrices, self.n_u, self.n_y, n_windows=self.n_windows, tolerance=self.rank_tolerance
+            )
 
     @property
     def device(self) -> torch.device:

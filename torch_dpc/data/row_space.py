@@ -8,23 +8,11 @@ squares of the other entries of a.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
-
-if TYPE_CHECKING:
-    from .hankel import HankelData
-
-#: Singular values at or below this fraction of the largest count as zero. Double-precision recordings of a
-#: noise-free system leave about 1e-15; single-precision ones carry rounding of 6e-8 a sample.
-RANK_TOLERANCE = {torch.float64: 1e-10, torch.float32: 1e-5}
-
-
-def relative_tolerance(dtype: torch.dtype) -> float:
-    """Return the documented rank tolerance for data of a precision."""
-    return RANK_TOLERANCE.get(dtype, 1e-2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,6 +21,7 @@ class RowSpace:
 
     Attributes:
         basis: B, `(n_g, rank)`, float64, orthonormal columns; the first `rank_W` span the rows of W.
+        units: the unit of each row's channel, `(n_rows,)`, float64: a power of two near its root mean square.
         rank: the numerical rank of the stacked matrix.
         rank_W: the numerical rank of W.
         n_rows: the rows of the stacked matrix, (t_ini + horizon)(n_u + n_y).
@@ -41,6 +30,7 @@ class RowSpace:
     """
 
     basis: Tensor
+    units: Tensor
     rank: int
     rank_W: int
     n_rows: int
@@ -60,17 +50,23 @@ class RowSpace:
         return replace(self, basis=torch.eye(self.rank, dtype=self.basis.dtype, device=self.basis.device))
 
     @staticmethod
-    def of(data: HankelData) -> RowSpace:
+    def of(matrices: Sequence[Tensor], n_u: int, n_y: int, *, n_windows: int, tolerance: float) -> RowSpace:
         """Factor the data once: QR of the columns, then two small SVDs that decide the ranks.
 
-        Every channel is brought to one scale first, so that the rank does not depend on the units; both ranks are
+        Every channel is brought to its own unit first, so that the rank does not depend on the units; both ranks are
         judged against the largest singular value of the whole stacked matrix, the remainder of Yf included.
+
+        Args:
+            matrices: Up, Yp, Uf, Yf, each `(rows, n_g)`.
+            n_u, n_y: inputs and outputs of the system.
+            n_windows: the recorded windows behind the columns.
+            tolerance: singular values at or below this fraction of the largest count as zero.
         """
-        stacked = torch.cat([_to_unit_channels(m.detach().double(), n) for m, n in _with_channels(data)])
-        tolerance = data.rank_tolerance
+        units = row_units(matrices, n_u, n_y, n_windows)
+        stacked = torch.cat([m.detach().double() for m in matrices]) / units[:, None]
         columns, R = torch.linalg.qr(stacked.T)  # n_g enters here and nowhere else
         rows = R.T
-        n_W = rows.shape[0] - data.Yf.shape[0]
+        n_W = rows.shape[0] - matrices[-1].shape[0]
         largest = torch.linalg.matrix_norm(rows, ord=2).clamp_min(torch.finfo(torch.float64).tiny)
         in_W, kept_W, dropped_W = _right_range(rows[:n_W], tolerance * largest)
         remainder = rows[n_W:] - (rows[n_W:] @ in_W) @ in_W.T
@@ -82,6 +78,7 @@ class RowSpace:
         dropped = torch.cat([dropped_W, dropped_rest]) / largest
         return RowSpace(
             basis=basis,
+            units=units,
             rank=basis.shape[1],
             rank_W=in_W.shape[1],
             n_rows=rows.shape[0],
@@ -90,16 +87,25 @@ class RowSpace:
         )
 
 
-def _with_channels(data: HankelData) -> list[tuple[Tensor, int]]:
-    Up, Yp, Uf, Yf = data.matrices
-    return [(Up, data.n_u), (Yp, data.n_y), (Uf, data.n_u), (Yf, data.n_y)]
+def row_units(matrices: Sequence[Tensor], n_u: int, n_y: int, n_windows: int) -> Tensor:
+    """Return the unit of each row of [Up; Yp; Uf; Yf], `(n_rows,)`, float64; arguments as of :meth:`RowSpace.of`."""
+    Up, Yp, Uf, Yf = (m.detach().double() for m in matrices)
+    unit_u = _channel_units(torch.cat([Up, Uf]), n_u, n_windows)
+    unit_y = _channel_units(torch.cat([Yp, Yf]), n_y, n_windows)
+    past, future = len(Up) // n_u, len(Uf) // n_u
+    return torch.cat([unit_u.repeat(past), unit_y.repeat(past), unit_u.repeat(future), unit_y.repeat(future)])
 
 
-def _to_unit_channels(matrix: Tensor, channels: int) -> Tensor:
-    """Divide every channel's rows by their root mean square (an idle channel stays zero)."""
-    blocks = matrix.reshape(-1, channels, matrix.shape[1])
-    scale = blocks.square().mean(dim=(0, 2), keepdim=True).sqrt()
-    return (blocks / torch.where(scale > 0, scale, 1.0)).reshape(matrix.shape)
+def _channel_units(rows: Tensor, channels: int, n_windows: int) -> Tensor:
+    """Return the unit of each channel, `(channels,)`: the power of two nearest to its root mean square, 1 if idle.
+
+    Multiplication by a power of two is exact, so that scaling by a unit and back loses nothing.
+    """
+    largest = rows.abs().amax(dim=1).reshape(-1, channels).amax(dim=0)  # first, so that no square under- or overflows
+    scaled = rows.reshape(-1, channels, rows.shape[1]) / torch.where(largest > 0, largest, 1.0)[:, None]
+    mean_square = scaled.square().sum(dim=(0, 2)) / (scaled.shape[0] * n_windows)
+    size = torch.where(largest > 0, largest * mean_square.sqrt(), 1.0)
+    return torch.exp2(size.log2().round())
 
 
 def _right_range(matrix: Tensor, cutoff: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -1,4 +1,4 @@
-"""The DPC problem: data, weights and sets, and its compact form as the paper writes it.
+"""The compact form of the problem, as the paper writes it.
 
     minimise over u, y, g   1/2 |y - y_ref|_Q^2 + 1/2 |u - u_ref|_R^2 + lambda_g |M g|^2 + lambda_s |Yp g - y_ini|^2
     subject to              Up g = u_ini,  u = Uf g,  y = Yf g,  u in U,  y in Y
@@ -8,15 +8,13 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from ..data.hankel import HankelData
-from ..data.hankel_batch import HankelBatch
-from .rows import Terms
+from .terms import Sizes, Terms
 from .weights import Weights
 
 
@@ -27,55 +25,6 @@ class CompactForm(NamedTuple):
     q: Tensor
     H: Tensor
     b: Tensor
-
-
-@dataclass(frozen=True)
-class Sizes:
-    """How many entries each part of theta = (u_ini, y_ini, u_ref, y_ref) and of v = (u, y, du) has, and how many steps.
-
-    du, the changes of the input, has entries only where the problem speaks of them.
-    """
-
-    u_ini: int
-    y_ini: int
-    u: int
-    y: int
-    horizon: int
-    du: int = 0
-
-    @staticmethod
-    def of(data: HankelData | HankelBatch, terms: Terms = Terms()) -> Sizes:  # noqa: B008
-        """Read the sizes off the data."""
-        past, future = data.t_ini, data.horizon
-        n_u, n_y = data.n_u, data.n_y
-        return Sizes(past * n_u, past * n_y, future * n_u, future * n_y, future, future * n_u if terms.rates else 0)
-
-    @property
-    def v(self) -> int:
-        """The constrained rows, N."""
-        return self.u + self.y + self.du
-
-    @property
-    def theta(self) -> tuple[int, int, int, int]:
-        """The sizes of the four parts of theta."""
-        return self.u_ini, self.y_ini, self.u, self.y
-
-    def split(self, v: Any) -> tuple[Any, Any]:
-        """Return u `(..., horizon, n_u)` and y `(..., horizon, n_y)` of v, a tensor or an array `(..., N)`."""
-        batch = v.shape[:-1]
-        u, y = v[..., : self.u], v[..., self.u : self.u + self.y]
-        return (
-            u.reshape((*batch, self.horizon, self.u // self.horizon)),
-            y.reshape((*batch, self.horizon, self.y // self.horizon)),
-        )
-
-    def join(self, u: Tensor | None, y: Tensor | None, like: Tensor) -> Tensor:
-        """Return v `(*batch, N)` of u and y, `(*batch, horizon, n)`, zero where they are None and shaped as `like`."""
-        batch = like.shape[:-1]
-        u = like.new_zeros(*batch, self.u) if u is None else u.reshape((*batch, self.u))
-        y = like.new_zeros(*batch, self.y) if y is None else y.reshape((*batch, self.y))
-        parts = [u, y, like.new_zeros(*batch, self.du)] if self.du else [u, y]
-        return torch.cat(parts, dim=-1)
 
 
 def projector(data: HankelData) -> Tensor:

@@ -21,7 +21,8 @@ from torch import Tensor
 
 from ..batching import flatten_batch, lead_all
 from ..data.hankel import HankelData
-from .compact_form import CompactForm, Sizes, compact_form
+from .compact_form import CompactForm, compact_form
+from .terms import Sizes
 from .weights import Weights
 
 #: Rounds of scaling rows and columns. One round of rows alone leaves errors 30 times as large; more gain nothing.

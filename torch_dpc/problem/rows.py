@@ -22,28 +22,12 @@ from ..autodiff import carries_derivative
 from ..batching import times
 from ..data.hankel import HankelData
 from .data_derivative import in_row_space
+from .terms import Terms
 
 #: How far u_ini may be from what the data can produce, relative to its norm.
 REACHABLE = 1e-8
 #: Singular values of the equality rows at or below this fraction of the largest count as zero.
 EQUALITY_RANK = 1e-10
-
-
-@dataclass(frozen=True)
-class Terms:
-    """Which terms the problem has beyond the paper's.
-
-    Attributes:
-        identity: lambda_g charges |g|^2 in place of |M g|^2.
-        slack: lambda_u |Up g - u_ini|^2 in place of Up g = u_ini.
-        rates: the changes of the input, u_t - u_(t-1), are constrained or charged.
-        terminal_steps: so many last outputs equal their reference.
-    """
-
-    identity: bool = False
-    slack: bool = False
-    rates: bool = False
-    terminal_steps: int = 0
 
 
 @dataclass(frozen=True)

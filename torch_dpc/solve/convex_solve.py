@@ -12,8 +12,8 @@ from torch import Tensor
 from ..autodiff import refuse_forward_twice, untransformed
 from ..batching import lead_all, times
 from ..errors import Status
-from ..problem.compact_form import Sizes
 from ..problem.reduction import Reduction
+from ..problem.terms import Sizes
 from ..sets.feasible import FeasibleSet
 from .infeasibility import separates_from_set
 from .optimality import BATCHED, WEAKLY_ACTIVE, Optimality

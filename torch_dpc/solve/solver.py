@@ -14,9 +14,9 @@ from torch import Tensor
 from ..batching import flatten_batch, times
 from ..checks import as_data, is_finite
 from ..errors import InfeasibleError, SolveError, Status
-from ..problem.compact_form import Sizes
 from ..problem.projected_kkt import FullSystem
 from ..problem.reduction import Reduction
+from ..problem.terms import Sizes
 from . import kernels
 from .active_set import solve_active
 from .dual_active_set import SOLVED_FLAG, Daqp, sense_of, solve_daqp

@@ -1,4 +1,4 @@
-"""Persistency of excitation: does the recorded input hold enough of every direction?"""
+"""The rank of recorded data: its tolerance, and persistency of excitation, a rank of the recorded input."""
 
 from __future__ import annotations
 
@@ -9,7 +9,17 @@ from torch import Tensor
 
 from ..errors import ExcitationWarning
 from .recordings import hankel
-from .row_space import relative_tolerance
+
+#: Singular values at or below this fraction of the largest count as zero. Double-precision recordings of a
+#: noise-free system leave about 1e-15; single-precision ones carry rounding of 6e-8 a sample.
+RANK_TOLERANCE = {torch.float64: 1e-10, torch.float32: 1e-5}
+#: The same for recordings of half precision.
+HALF_PRECISION_TOLERANCE = 1e-2
+
+
+def relative_tolerance(dtype: torch.dtype) -> float:
+    """Return the documented rank tolerance for data of a precision."""
+    return RANK_TOLERANCE.get(dtype, HALF_PRECISION_TOLERANCE)
 
 
 def excitation_order(recordings: list[Tensor]) -> int:
