@@ -19,18 +19,18 @@ help:  ## list the targets
 # One line a script, in the order in which they run.
 reproduce: $(ENV)  ## the paper's figures and tables, into results/
 	@mkdir -p results
-	$(PY) scripts/figure3_masses.py
-	@if $(PY) -c 'import pybullet' >/dev/null 2>&1; then set -x; $(PY) scripts/figure4_quadrotor.py; \
+	$(PY) -m scripts.figure3_masses
+	@if $(PY) -c 'import pybullet' >/dev/null 2>&1; then set -x; $(PY) -m scripts.figure4_quadrotor; \
 	else echo "NOTE: without PyBullet there is no Figure 4"; fi
-	$(PY) scripts/table1_sizes.py
-	$(PY) scripts/report.py
+	$(PY) -m scripts.table1_sizes
+	$(PY) -m scripts.report
 
 test: $(ENV)  ## every test and docstring example (ARGS="-m 'not slow'" for the quick ones)
 	@ignore=; $(PY) -c 'import pybullet' 2>/dev/null || ignore=--ignore=torch_dpc/systems/quadrotor.py; \
 	set -x; $(PY) -m pytest -n auto --dist worksteal tests --doctest-modules torch_dpc baselines $$ignore $(ARGS)
 
 bench: $(ENV)  ## time and error of the layer (ARGS=--quick for a short run)
-	$(PY) scripts/benchmark.py $(ARGS)
+	$(PY) -m scripts.benchmark $(ARGS)
 
 docs: .venv/.complete-docs  ## the documentation, into site/
 	$(PY) -m sphinx -q -W --keep-going docs site

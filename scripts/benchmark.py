@@ -1,14 +1,15 @@
 """Benchmark: time and error of torch_dpc beside other solvers and differentiable QP layers.
 
-    python scripts/benchmark.py             # about 40 minutes on two cores
-    python scripts/benchmark.py --quick     # under 2 minutes: the masses at horizon 25, the fastest peers
-    python scripts/benchmark.py --scaling   # the number of recorded windows, 500 to 50,000, alone
-    python scripts/benchmark.py --docs      # everything, then Table I and the profile, all into docs/benchmarks.md
+    python -m scripts.benchmark             # about 40 minutes on two cores
+    python -m scripts.benchmark --quick     # under 2 minutes: the masses at horizon 25, the fastest peers
+    python -m scripts.benchmark --scaling   # the number of recorded windows, 500 to 50,000, alone
+    python -m scripts.benchmark --docs      # everything, then Table I and the profile, all into docs/benchmarks.md
 
 Both plants of the paper, horizons 25 to 100, batches 1 to 1024; every peer in `baselines/` on the QP as the paper
 prints it and on our reduced form. Each row is measured in a process of its own, so a peer that crashes, hangs or eats
 memory touches nothing else, and is saved at once: a run that is stopped goes on where it was, and rows measured before
-with the same versions and sources are not measured again (`--fresh` starts over). Errors are against `_reference.py`.
+with the same versions and sources are not measured again (`--fresh` starts over). Errors are against
+`bench/higher_precision.py`.
 Leaves, in results/:
 
     benchmark.csv       one line a row: times with quartiles, memory, errors, versions
@@ -34,18 +35,25 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))  # baselines/ lies beside scripts/
+from tqdm import tqdm
 
-from tqdm import tqdm  # noqa: E402
+from scripts.bench.cases import LOOP, OURS, SEED, Row, full_rows, quick_rows, scaling_rows, write_case
+from scripts.bench.docs import refresh
+from scripts.bench.report import write_report
+from scripts.bench.row import MARK, measure
+from scripts.shared.command import RESULTS, ROOT, cores
+from torch_dpc.solve.kernels import instructions
 
-from _bench_cases import LOOP, OURS, SEED, Row, full_rows, quick_rows, scaling_rows, write_case  # noqa: E402
-from _bench_docs import refresh  # noqa: E402
-from _bench_report import write_report  # noqa: E402
-from _bench_row import MARK, measure  # noqa: E402
-from _common import RESULTS, cores  # noqa: E402
-from torch_dpc.solve.kernels import instructions  # noqa: E402
-
+PROGRAM = ["-m", "scripts.benchmark"]  # what measures one row, given `--row`
+MEASURED_BY = (
+    "bench/row",
+    "bench/timing",
+    "bench/cases",
+    "bench/daqp_loop",
+    "bench/higher_precision",
+    "experiments/masses",
+    "experiments/quadrotor",
+)
 TIME_LIMIT = {"full": 60.0, "quick": 20.0}  # [s] a row, imports included
 
 SOURCES = (".py", ".c", ".h")
@@ -106,12 +114,18 @@ def _one(row: Row, folder: Path, mode: str, threads: int, lines: dict[Any, Line]
 
 def in_a_process(order: Line, limit: float) -> Line:
     """Run `--row` in a process of its own; return the last thing it told, and how it ended if that was not well."""
-    command = [sys.executable, str(Path(__file__).resolve()), "--row", json.dumps(order)]
+    command = [sys.executable, *PROGRAM, "--row", json.dumps(order)]
     pools = ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS", "RAYON_NUM_THREADS")
     environment = {**os.environ, **dict.fromkeys(pools, str(order["threads"]))}
     with tempfile.TemporaryFile("w+") as said, tempfile.TemporaryFile("w+") as complained:
         process = subprocess.Popen(
-            command, stdout=said, stderr=complained, stdin=subprocess.DEVNULL, env=environment, start_new_session=True
+            command,
+            stdout=said,
+            stderr=complained,
+            stdin=subprocess.DEVNULL,
+            cwd=ROOT,
+            env=environment,
+            start_new_session=True,
         )
         ended, why = "", ""
         try:
@@ -175,10 +189,7 @@ def _stamp(row: Row, mode: str, threads: int) -> Line:
     folders = {"ours": ["torch_dpc"], "loop": [], "peers": ["baselines"]}
     made_of = folders["ours" if row.name in OURS else "loop" if row.name == LOOP else "peers"]
     files = [path for folder in made_of for path in sorted((ROOT / folder).rglob("*")) if path.suffix in SOURCES]
-    files += [
-        ROOT / "scripts" / name
-        for name in ("_bench_row.py", "_bench_timing.py", "_bench_cases.py", "_daqp_loop.py", "_reference.py")
-    ]
+    files += [ROOT / "scripts" / f"{name}.py" for name in MEASURED_BY]
     digest = hashlib.sha256(b"".join(path.read_bytes() for path in files)).hexdigest()[:8]
     return {
         "mode": mode,
@@ -242,9 +253,9 @@ def main(argv: list[str] | None = None) -> None:
     lines = read_lines(args.out / "benchmark.csv")
     print(write_report(args.out, lines))
     if args.docs:
-        for script, threads in (("table1_sizes.py", []), ("profile_layer.py", ["--threads", str(args.threads)])):
-            command = [sys.executable, str(ROOT / "scripts" / script), "--out", str(args.out), *threads]
-            subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+        for script, threads in (("table1_sizes", []), ("profile_layer", ["--threads", str(args.threads)])):
+            command = [sys.executable, "-m", f"scripts.{script}", "--out", str(args.out), *threads]
+            subprocess.run(command, cwd=ROOT, check=True, stdout=subprocess.DEVNULL)
         refresh(ROOT / "docs" / "benchmarks.md", args.out, lines)
 
 

@@ -1,8 +1,8 @@
 """A campaign: plants x seeds x rho x attacks x weights in closed loop, on this machine's cores or on a cluster.
 
-    python scripts/campaign.py scripts/campaigns/example.toml           # 1,000 runs, about a minute on two cores
-    python scripts/campaign.py FILE --backend dask --scheduler tcp://HOST:8786
-    python scripts/campaign.py FILE --backend ray --scheduler auto
+    python -m scripts.campaign scripts/campaigns/example.toml           # 1,000 runs, about a minute on two cores
+    python -m scripts.campaign FILE --backend dask --scheduler tcp://HOST:8786
+    python -m scripts.campaign FILE --backend ray --scheduler auto
 
 Rows are written as they finish; a killed campaign goes on where it stopped, and the rows of a worker that is killed are
 run again by another. A row depends on its own line of the configuration alone. Leaves, in results/:
@@ -22,11 +22,11 @@ from typing import Any
 
 from tqdm import tqdm
 
-from _campaign_backends import BACKENDS, Lost, open_backend
-from _campaign_config import RunConfig, load
-from _campaign_plot import plot
-from _campaign_store import Store
-from _common import RESULTS, cores, versions
+from scripts.campaigns.backends import BACKENDS, Lost, open_backend
+from scripts.campaigns.config import RunConfig, load
+from scripts.campaigns.plot import plot
+from scripts.campaigns.store import Store
+from scripts.shared.command import RESULTS, cores, versions
 
 CHUNK = 25  # rows at most: what one kill can cost a worker
 PATIENCE = 3  # times in a row that workers may be lost without a finished chunk in between

@@ -1,6 +1,6 @@
 """Profile: where a call of the layer spends its time, at batch 1 and batch 1024.
 
-    python scripts/profile_layer.py         # about 15 s on two cores
+    python -m scripts.profile_layer         # about 15 s on two cores
 
 The oscillating masses at horizon 25, the problems of `benchmark.py`. Each stage is timed alone, on the inputs that it
 has in the call, so the stages need not add up to the call to the last microsecond. Leaves results/profile.md.
@@ -23,8 +23,8 @@ import torch
 from torch import Tensor
 
 import torch_dpc as dpc
-from _bench_cases import CYCLE, N_G, T_INI, inputs_of, layer_of, record, take
-from _common import RESULTS, cores, versions
+from scripts.bench.cases import CYCLE, N_G, T_INI, inputs_of, layer_of, record, take
+from scripts.shared.command import RESULTS, cores, versions
 from torch_dpc.solve import kernels
 from torch_dpc.solve.active_set import adjoint
 from torch_dpc.solve.newton import solve_newton

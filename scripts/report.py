@@ -1,6 +1,6 @@
 """Gather what the figure and table scripts left into results/report.md.
 
-Command: `python scripts/report.py`, after the other scripts; it takes a second.
+Command: `python -m scripts.report`, after the other scripts; it takes a second.
 """
 
 from __future__ import annotations
@@ -10,8 +10,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-from _common import RESULTS
-from _plots import percent
+from scripts.shared.command import RESULTS
+from scripts.shared.plots import percent
 
 FIGURES = {
     "figure3_masses": (
@@ -88,7 +88,7 @@ def figure_section(folder: Path, name: str) -> list[str]:
     title, remark, pictures = FIGURES[name]
     file = folder / f"{name}.json"
     if not file.exists():
-        return ["", f"## {title}", "", f"Not made: run `python scripts/{name}.py`."]
+        return ["", f"## {title}", "", f"Not made: run `python -m scripts.{name}`."]
     result = json.loads(file.read_text())
     lines = ["", f"## {title}", "", remark, ""]
     lines += [f"![{picture}]({picture})" for picture in pictures if (folder / picture).exists()]

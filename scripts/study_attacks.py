@@ -1,7 +1,7 @@
 """Study: how much further attacks of several steps go than Algorithm 1, over every budget; beyond the paper.
 
-    python scripts/study_attacks.py             # about 2 minutes on two cores
-    python scripts/study_attacks.py --quick     # about 30 s: one seed, fewer windows
+    python -m scripts.study_attacks             # about 2 minutes on two cores
+    python -m scripts.study_attacks --quick     # about 30 s: one seed, fewer windows
 
 The settings of Figures 3 and 4 at their largest rho, on held-out windows of a recording that the controller has not
 seen, for two costs: `TargetInput`, the figure's own, and `TrackingError`, the predicted true output driven away from
@@ -21,8 +21,10 @@ from typing import Any
 import numpy as np
 import torch
 
-from _common import ATTACK_SEED, Rows, arguments, read_rows, run_all, versions, write_rows
-from _surrogates import closed_loop, load, surrogate
+from scripts.experiments.case import ATTACK_SEED
+from scripts.experiments.surrogates import closed_loop, load, surrogate
+from scripts.shared.command import arguments, run_all, versions
+from scripts.shared.rows import Rows, read_rows, write_rows
 from torch_dpc import attacks
 
 SEEDS, QUICK_SEEDS = 3, 1

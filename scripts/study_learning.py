@@ -1,6 +1,6 @@
 """Study: what weights that learn, and sets that are no boxes, cost.
 
-    python scripts/study_learning.py        # about 1 minute on two cores
+    python -m scripts.study_learning        # about 1 minute on two cores
 
 The paper's two plants at horizon 25, batch 16, windows of the recording perturbed by 2 %. A step is a forward, a
 backward of |u|^2 and a step of Adam. Leaves results/learning.md and results/learning.csv.
@@ -20,8 +20,8 @@ import torch
 from torch import nn
 
 import torch_dpc as dpc
-from _bench_cases import N_G, T_INI, inputs_of, layer_of, record, take
-from _common import RESULTS, cores, versions
+from scripts.bench.cases import N_G, T_INI, inputs_of, layer_of, record, take
+from scripts.shared.command import RESULTS, cores, versions
 
 HORIZON, BATCH, CALLS, REPEATS = 25, 16, 10, 7
 

@@ -1,7 +1,7 @@
 """Study: how the tracking error grows with rho, and where each controller breaks; beyond the paper.
 
-    python scripts/study_sensitivity.py             # about 2 minutes on two cores
-    python scripts/study_sensitivity.py --quick     # about 20 s: two seeds, four rho
+    python -m scripts.study_sensitivity             # about 2 minutes on two cores
+    python -m scripts.study_sensitivity --quick     # about 20 s: two seeds, four rho
 
 The settings of Figures 3 and 4 with rho on a logarithmic grid, for Algorithm 1 and random noise. A run of the masses
 fails when an output leaves its bounds, a flight when the vehicle crashes (it then counts as lying there). Leaves, in
@@ -20,25 +20,15 @@ from typing import Any
 
 import numpy as np
 
-import figure3_masses
-import figure4_quadrotor
-from _common import (
-    NOMINAL,
-    POISON,
-    RANDOM,
-    Array,
-    Rows,
-    arguments,
-    band,
-    grid,
-    read_rows,
-    run_all,
-    versions,
-    write_rows,
-)
-from _plots import COLOURS, NAMES, draw_band, percent, plt, style
+from scripts.experiments.case import Case, run_seed
+from scripts.experiments.masses import Masses
+from scripts.experiments.quadrotor import Quadrotor
+from scripts.shared.command import arguments, run_all, versions
+from scripts.shared.plots import COLOURS, NAMES, draw_band, percent, plt, style
+from scripts.shared.rows import Array, Rows, grid, read_rows, write_rows
+from scripts.shared.statistics import NOMINAL, POISON, RANDOM, band
 
-EXPERIMENTS = {"masses": figure3_masses, "quadrotor": figure4_quadrotor}
+EXPERIMENTS: dict[str, Case] = {"masses": Masses(), "quadrotor": Quadrotor()}
 TITLES = {"masses": "oscillating masses", "quadrotor": "quadrotor"}
 RHO = {"masses": np.logspace(-3, 0, 13), "quadrotor": np.logspace(-4, -1.5, 11)}  # 0.1 to 100 %, 0.01 to 3.2 %
 QUICK_SEEDS, QUICK_EVERY = 2, 4
@@ -49,7 +39,7 @@ little: a crashed vehicle counts as lying where it crashed."""
 FAILS = {"masses": "an output beyond its bounds", "quadrotor": "a crash"}
 
 
-def run_seed(plant: str, seed: int, rhos: Array) -> list[dict[str, Any]]:
+def run_plant(plant: str, seed: int, rhos: Array) -> list[dict[str, Any]]:
     """Return one row for every run of one seed on one plant."""
     return [
         {
@@ -61,9 +51,9 @@ def run_seed(plant: str, seed: int, rhos: Array) -> list[dict[str, Any]]:
             "max_error": run["error"].max(),
             "failed": bool(failed(run).any()),
             "failed_at": run["t"][failed(run).argmax()] if failed(run).any() else np.nan,
-            "unsolved": run["unsolved"][:: EXPERIMENTS[plant].REPLAN_EVERY].sum(),
+            "unsolved": run["unsolved"][:: EXPERIMENTS[plant].replan_every].sum(),
         }
-        for run in EXPERIMENTS[plant].run_seed(seed, rhos)
+        for run in run_seed(EXPERIMENTS[plant], seed, rhos)
     ]
 
 
@@ -71,7 +61,8 @@ def failed(run: dict[str, Any]) -> Array:
     """Return whether the run has failed, at each step."""
     if "crashed" in run:
         return run["crashed"]
-    return np.max([np.abs(run[f"y{i}"]) for i in (1, 2, 3, 4)], axis=0) > figure3_masses.Y_MAX
+    outputs = np.stack([np.abs(run[f"y{i}"]) for i in (1, 2, 3, 4)], axis=1)
+    return (outputs > EXPERIMENTS["masses"].y_max).any(axis=1)
 
 
 def of_plant(rows: Rows, plant: str) -> Rows:
@@ -152,7 +143,7 @@ def main(argv: list[str] | None = None) -> None:
     began, note = time.perf_counter(), versions(seeds, args.workers)
 
     jobs = [(plant, seed, RHO[plant][::every]) for plant in EXPERIMENTS for seed in range(seeds)]
-    runs = run_all(run_seed, jobs, args.workers, "Sensitivity")
+    runs = run_all(run_plant, jobs, args.workers, "Sensitivity")
     write_rows(out / "study_sensitivity.csv", (run for job in runs for run in job), note)
 
     rows = read_rows(out / "study_sensitivity.csv")

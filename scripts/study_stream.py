@@ -1,7 +1,7 @@
 """Study: streams of any length in constant memory, online updates, and files of saved layers.
 
-    python scripts/study_stream.py             # about 2 minutes on one core, 10 million samples included
-    python scripts/study_stream.py --quick     # about 30 s: a hundredth of the samples
+    python -m scripts.study_stream             # about 2 minutes on one core, 10 million samples included
+    python -m scripts.study_stream --quick     # about 30 s: a hundredth of the samples
 
 Every stream is one ongoing recording of a linear plant with noise, simulated chunk by chunk, in a process of its own.
 Rows are saved as they are made; a run that is stopped goes on where it was (`--fresh` starts over). Leaves, in
@@ -31,15 +31,17 @@ from scipy.signal import lfilter
 from tqdm import tqdm
 
 import torch_dpc as dpc
-from _common import Array, arguments, versions
-from _stream_adaptation import CHANGE, FORGETTINGS, plot, track
+from scripts.experiments.masses import Masses
+from scripts.experiments.stream_adaptation import CHANGE, FORGETTINGS, plot, track
+from scripts.shared.command import arguments, versions
+from scripts.shared.rows import Array
 
-T_INI, HORIZON = 6, 25  # the paper's
+T_INI, HORIZON = Masses.t_ini, Masses.horizon
 CHUNK = 20_000  # samples that the plant makes at once
 NOISE = 1e-2
 SAMPLES = {"masses": (100_000, 1_000_000, 10_000_000), "quadrotor": (100_000, 1_000_000)}
 QUICK = 100  # --quick makes this share
-WEIGHTS = {"Q": 10.0, "R": 1.0, "lambda_g": 100.0, "lambda_s": 1e6}
+WEIGHTS = {"Q": 10.0, "R": 1.0, "lambda_g": Masses.lambda_g, "lambda_s": Masses.lambda_s}
 UPDATES = 300
 N_G = (500, 50_000)
 SEED = 0

@@ -1,7 +1,7 @@
 """Study: how much of an attack survives when the attacker does not know the controller; beyond the paper.
 
-    python scripts/study_transfer.py            # about 2 minutes on two cores
-    python scripts/study_transfer.py --quick    # about 20 s: one seed, fewer windows
+    python -m scripts.study_transfer            # about 2 minutes on two cores
+    python -m scripts.study_transfer --quick    # about 20 s: one seed, fewer windows
 
 The settings of Figures 3 and 4 at their largest rho. The attacker plans p on a surrogate, a layer with other data,
 weights or horizon than the controller's, or asks the controller itself for its inputs, so many windows at a time. What
@@ -26,9 +26,11 @@ import numpy as np
 import torch
 
 import torch_dpc as dpc
-from _common import ATTACK_SEED, Array, Rows, arguments, read_rows, run_all, versions, write_rows
-from _plots import plt, style
-from _surrogates import SURROGATES, Plant, closed_loop, load, surrogate
+from scripts.experiments.case import ATTACK_SEED
+from scripts.experiments.surrogates import SURROGATES, Plant, closed_loop, load, surrogate
+from scripts.shared.command import arguments, run_all, versions
+from scripts.shared.plots import plt, style
+from scripts.shared.rows import Array, Rows, read_rows, write_rows
 
 SEEDS, QUICK_SEEDS = 5, 1
 WINDOW_EVERY, QUICK_EVERY = 12, 48  # steps between held-out windows

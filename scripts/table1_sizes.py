@@ -1,6 +1,6 @@
 """Table I: the size of the system that each method solves to differentiate one plan.
 
-    python scripts/table1_sizes.py          # about 10 s on two cores
+    python -m scripts.table1_sizes          # about 10 s on two cores
 
 Every number is read off what is solved, none is computed from a formula: from CVXPYlayers' own canonicalised cone
 program (m rows and n variables make a homogeneous self-dual embedding of m + n + 1), from the Jacobian J of the paper's
@@ -16,25 +16,20 @@ from __future__ import annotations
 
 import argparse
 import csv
-import sys
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import torch
 from tqdm import tqdm
 
 import torch_dpc as dpc
-
-ROOT = Path(__file__).resolve().parent.parent
-sys.path.insert(0, str(ROOT))  # baselines/ lies beside scripts/
-
-from baselines import CvxpyLayersDPC, FullKKT  # noqa: E402
+from baselines import CvxpyLayersDPC, FullKKT
+from scripts.experiments.masses import Masses
+from scripts.experiments.quadrotor import Quadrotor
+from scripts.shared.command import RESULTS
 
 HORIZONS = (25, 50, 100)
-T_INI, N_G = 6, 500
-QUADROTOR_N_U, QUADROTOR_N_Y = 3, 6
-Q, R, LAMBDA_G, LAMBDA_S = 10.0, 1.0, 100.0, 1e6
-U_MAX, Y_MAX = 1.0, 5.0
 SEED = 0
 
 METHODS: dict[str, Callable[[dpc.DPCLayer], int]] = {
@@ -46,24 +41,15 @@ METHODS: dict[str, Callable[[dpc.DPCLayer], int]] = {
 
 def masses_layer(horizon: int) -> dpc.DPCLayer:
     """Return the paper's problem on the oscillating masses."""
-    generator = torch.Generator().manual_seed(SEED)
-    u, y = dpc.collect(dpc.systems.OscillatingMasses(), N_G + T_INI + horizon - 1, generator=generator)
-    return layer_of(u, y, horizon)
+    return replace(Masses(), horizon=horizon).planner(SEED)
 
 
 def quadrotor_layer(horizon: int) -> dpc.DPCLayer:
     """Return a problem of the quadrotor's dimensions, with random numbers for data."""
-    generator = torch.Generator().manual_seed(SEED)
-    samples = N_G + T_INI + horizon - 1
-    u, y = (torch.randn(samples, n, dtype=torch.float64, generator=generator) for n in (QUADROTOR_N_U, QUADROTOR_N_Y))
-    return layer_of(u, y, horizon)
-
-
-def layer_of(u: torch.Tensor, y: torch.Tensor, horizon: int) -> dpc.DPCLayer:
-    """Return the layer of one recording."""
-    data = dpc.HankelData.from_trajectories(u, y, t_ini=T_INI, horizon=horizon)
-    u_set, y_set = dpc.Box(-U_MAX, U_MAX), dpc.Box(-Y_MAX, Y_MAX)
-    return dpc.DPCLayer(data, Q, R, LAMBDA_G, LAMBDA_S, u_set, y_set)
+    case, generator = replace(Quadrotor(), horizon=horizon), torch.Generator().manual_seed(SEED)
+    sizes = (len(case.R), len(case.Q))
+    u, y = (torch.randn(case.samples, n, dtype=torch.float64, generator=generator) for n in sizes)
+    return case.layer(case.hankel(u, y))
 
 
 PLANTS: dict[str, Callable[[int], dpc.DPCLayer]] = {"masses": masses_layer, "quadrotor": quadrotor_layer}
@@ -89,8 +75,8 @@ def write(found: dict[tuple[str, int], dict[str, int]], out: Path) -> None:
         "|---|" + "---:|" * len(found),
         *("| " + " | ".join(map(str, row)) + " |" for row in rows),
         "",
-        f"t_ini = {T_INI}, n_g = {N_G}. CVXPYlayers: m + n + 1 of its own cone program; the others: the order of the "
-        "matrix that is built. The quadrotor's data are random numbers of its dimensions.",
+        f"t_ini = {Masses.t_ini}, n_g = {Masses.n_g}. CVXPYlayers: m + n + 1 of its own cone program; the others: the "
+        "order of the matrix that is built. The quadrotor's data are random numbers of its dimensions.",
     ]
     (out / "table1_sizes.md").write_text("\n".join(lines) + "\n")
 
@@ -98,7 +84,7 @@ def write(found: dict[tuple[str, int], dict[str, int]], out: Path) -> None:
 def main() -> None:
     """Read every size and write the table."""
     parser = argparse.ArgumentParser(description=__doc__.splitlines()[0])
-    parser.add_argument("--out", type=Path, default=ROOT / "results", help="folder for the results (default results/)")
+    parser.add_argument("--out", type=Path, default=RESULTS, help="folder for the results (default results/)")
     out = parser.parse_args().out
     torch.set_num_threads(1)  # small matrices: more threads only wait for one another
     cases = [(plant, horizon) for plant in PLANTS for horizon in HORIZONS]

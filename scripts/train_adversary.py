@@ -1,8 +1,8 @@
 """Train adversaries by backprop, a network in place of Algorithm 1, and judge them on what they have not seen.
 
-    python scripts/train_adversary.py --plant masses        # about 1 minute on two cores
-    python scripts/train_adversary.py --plant quadrotor     # about 2 minutes
-    torchrun --nproc-per-node 2 scripts/train_adversary.py --plant masses       # the same, each batch on two processes
+    python -m scripts.train_adversary --plant masses        # about 1 minute on two cores
+    python -m scripts.train_adversary --plant quadrotor     # about 2 minutes
+    torchrun --nproc-per-node 2 -m scripts.train_adversary --plant masses       # the same, each batch on two processes
 
 `--mode windows` trains through the layer on windows recorded in closed loop: Algorithm 1's direction is imitated, then
 psi lowered. `--mode closed-loop` goes on from the imitation and makes the error of the whole run large, back through
@@ -28,12 +28,13 @@ from typing import Any
 import torch
 import torch.distributed as dist
 
-import _adversary_judge as judge
-from _adversary_loop import HELD_OUT, TRAINING, Windows
-from _adversary_losses import LoopLoss, WindowLosses, psi_at
-from _adversary_report import picture, windows_table, write_report
-from _adversary_training import Stage, process_group, rank, read_tensors, train, world, write_tensors
-from _common import arguments, read_rows, run_all, versions, write_rows
+from scripts.adversary import judge
+from scripts.adversary.losses import LoopLoss, WindowLosses, psi_at
+from scripts.adversary.report import picture, windows_table, write_report
+from scripts.adversary.training import Stage, process_group, rank, read_tensors, train, world, write_tensors
+from scripts.experiments.closed_loops import HELD_OUT, TRAINING, Windows
+from scripts.shared.command import arguments, run_all, versions
+from scripts.shared.rows import read_rows, write_rows
 from torch_dpc import attacks
 
 HIDDEN = [16]
@@ -84,13 +85,13 @@ class Training:
     ):
         self.plant, self.out, self.size, self.seed, self.workers = judge.PLANTS[plant](), out, size, seed, workers
         self.hidden = hidden
-        self.layer = self.plant.layer(TRAINING)
+        self.layer = self.plant.planner(TRAINING)
         self.windows = self._recorded("recording", 1000 * (1 + seed), size["runs"], every_step=True)
         self.held_out = self._recorded("held_out", HELD_OUT, size["kept"], every_step=False)
 
     def checkpoint(self, mode: str) -> Path:
         """Return where a network is kept."""
-        return self.out / f"adversary_{self.plant.name}_{mode}.safetensors"
+        return self.out / f"adversary_{self.plant.plant}_{mode}.safetensors"
 
     def forget(self, modes: Sequence[str]) -> None:
         """Delete the checkpoints, by the first process for all."""
@@ -124,9 +125,9 @@ class Training:
                 Stage("closed loop", loss, size["loop"], RATE["loop"], LARGEST_GRADIENT, every=5),
             ]
             validate = self._validate_loop(policy)
-        settings = {"plant": self.plant.name, "mode": mode, "seed": self.seed, "hidden": list(self.hidden)}
+        settings = {"plant": self.plant.plant, "mode": mode, "seed": self.seed, "hidden": list(self.hidden)}
         settings |= {key: self.size[key] for key in ("batch", "loops", "runs")}
-        path, label = self.checkpoint(mode), f"{self.plant.name}, {mode}"
+        path, label = self.checkpoint(mode), f"{self.plant.plant}, {mode}"
         curve = train(policy, stages, path, settings=settings, validate=validate, label=label)
         before = list(itertools.accumulate((stage.iterations for stage in stages), initial=0))
         return [
@@ -142,10 +143,10 @@ class Training:
 
     def _recorded(self, name: str, seed: int, runs: int, *, every_step: bool) -> Windows:
         """Return recorded windows, from the disk if they are there; the first process records for all."""
-        path = self.out / f"adversary_{self.plant.name}_{name}.safetensors"
+        path = self.out / f"adversary_{self.plant.plant}_{name}.safetensors"
         made_with = {"seed": seed, "runs": runs, "every_step": every_step}
         if rank() == 0 and not (path.exists() and read_tensors(path)[1]["made_with"] == made_with):
-            windows = self.plant.record(seed, runs, self.workers, every_step=every_step)
+            windows = self.plant.record_windows(seed, runs, self.workers, every_step=every_step)
             write_tensors(path, windows.tensors(), {"made_with": made_with})
         if world() > 1:
             dist.barrier()
@@ -175,10 +176,10 @@ class Training:
 
         def error(attack: Any) -> float:
             outputs, _ = self.plant.loop(self.layer, attack, starts)
-            return float(self.plant.error(outputs, starts).mean())
+            return float(self.plant.mean_errors(outputs, starts).mean())
 
         budgets = [attacks.RelativeBall(rho) for rho in self.plant.rhos]
-        base = [error(attacks.LinearizedAttack(self.layer, self.plant.cost, budget)) for budget in budgets]
+        base = [error(attacks.LinearizedAttack(self.layer, self.plant.target(), budget)) for budget in budgets]
 
         @torch.no_grad()
         def validate() -> float:
@@ -193,7 +194,7 @@ def compare(training: Training, modes: Sequence[str], seeds: int, workers: int) 
     plant, paths = training.plant, {mode: training.checkpoint(mode) for mode in modes}
     policies = judge.load_policies(paths, training.layer)
     rows = judge.judge_windows(plant, training.layer, training.held_out, policies)
-    jobs = [(plant.name, setting, seed, paths) for setting in plant.settings for seed in range(seeds)]
+    jobs = [(plant.plant, setting, seed, paths) for setting in plant.settings for seed in range(seeds)]
     runs = [row for job in run_all(judge.judge_run, jobs, workers, "closed loop") for row in job]
     columns = dict.fromkeys(key for row in [*rows, *runs] for key in row)
     return [{key: row.get(key, float("nan")) for key in columns} for row in [*rows, *runs]]

@@ -1,7 +1,7 @@
 """Weights that hold under attack: Pareto front of nominal against attacked error, before and after; beyond the paper.
 
-    python scripts/tune_regularization.py                   # 11 minutes on two cores, busy with other work too
-    python scripts/tune_regularization.py --plants masses --quick
+    python -m scripts.tune_regularization                   # 11 minutes on two cores, busy with other work too
+    python -m scripts.tune_regularization --plants masses --quick
 
 lambda_g, lambda_s and the diagonals of Q and R are tuned on recorded windows of three training recordings
 (torch_dpc.tuning), by the gradient and by Optuna at the same processor time, and judged in closed loop on held-out
@@ -25,12 +25,13 @@ import torch
 from tqdm import tqdm
 
 import torch_dpc as dpc
-from _case import HELD_OUT_FROM, VALIDATION, Case, Run, Weights
-from _cases import CASES
-from _common import arguments, versions
-from _tables import Table, as_they_finish
-from _tuning_report import HELD_OUT, VALIDATED, choose, write_report
-from _tuning_search import ATTACKED_WEIGHTS, ONLY_LAMBDAS, STEPS, Found, searches
+from scripts.experiments.all_cases import CASES
+from scripts.experiments.case import Case, Run, Weights
+from scripts.regularization.objectives import HELD_OUT_FROM, VALIDATION
+from scripts.regularization.report import HELD_OUT, VALIDATED, choose, write_report
+from scripts.regularization.search import ATTACKED_WEIGHTS, ONLY_LAMBDAS, STEPS, Found, searches
+from scripts.shared.command import arguments, versions
+from scripts.shared.tables import Table, as_they_finish
 
 LAMBDA_G = (1e0, 1e2, 1e4, 1e6)
 LAMBDA_S = (1e2, 1e3, 1e4, 1e5, 1e6, 1e8)

@@ -1,9 +1,8 @@
 """A stored flight of the quadrotor, so that tests can plan for it without PyBullet.
 
-`python tests/recordings.py` records it anew; the seed, the recipe and the versions are inside the file.
+`python -m tests.recordings`, from the root, records it anew; the seed, the recipe and the versions are inside the file.
 """
 
-import sys
 from importlib.metadata import version
 from pathlib import Path
 
@@ -27,12 +26,11 @@ def quadrotor_recording():
 
 def fly_again():
     """Return the same from the simulator."""
-    sys.path.insert(0, str(ROOT.parent / "scripts"))
-    from figure4_quadrotor import LiesWhereItCrashed, record
-    from torch_dpc.systems import Quadrotor
+    from scripts.experiments.quadrotor import Quadrotor
 
-    with Quadrotor() as plant:
-        return record(LiesWhereItCrashed(plant), SEED)
+    case = Quadrotor()
+    with case.system() as plant:
+        return case.record(plant, SEED)
 
 
 if __name__ == "__main__":

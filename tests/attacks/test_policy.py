@@ -5,7 +5,6 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 import torch
@@ -13,9 +12,6 @@ import torch
 import torch_dpc as dpc
 from helpers import HOLDING, Y_REF, generator, randn, relative, small_data, small_layer, windows
 from torch_dpc import attacks
-
-SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-sys.path.insert(0, str(SCRIPTS))
 
 INSIDE = 1e-9  # what every attack promises
 EXACT = 1e-12
@@ -254,10 +250,11 @@ pytest.importorskip("matplotlib", reason="the scripts draw with matplotlib")
 pytest.importorskip("tqdm", reason="the scripts show their progress with tqdm")
 pytest.importorskip("safetensors", reason="checkpoints are safetensors")
 
-import _adversary_training as training  # noqa: E402
-import train_adversary  # noqa: E402
-from _adversary_masses import Masses  # noqa: E402
-from _common import read_rows  # noqa: E402
+from scripts import train_adversary
+from scripts.adversary import training
+from scripts.experiments.masses import Masses
+from scripts.shared.command import ROOT
+from scripts.shared.rows import read_rows
 
 
 def test_trained_through_the_layer_it_lowers_psi_as_algorithm_1_does():
@@ -285,26 +282,26 @@ def test_trained_through_the_layer_it_lowers_psi_as_algorithm_1_does():
 
 def test_the_batched_loop_of_the_masses_is_simulate_and_so_is_its_derivative():
     plant = Masses()
-    layer = plant.layer(5)
+    layer = plant.planner(5)
     starts = plant.starts(3, 7)
     network = attacks.AttackPolicy(layer.data, hidden=(8,), context=plant.context, generator=generator())
     attack = attacks.PolicyAttack(network, attacks.RelativeBall(0.05))
     y, seen = plant.loop(layer, attack, starts)
-    batched = torch.autograd.grad(plant.error(y, starts).sum(), list(network.parameters()))
+    batched = torch.autograd.grad(plant.mean_errors(y, starts).sum(), list(network.parameters()))
     error = 0.0
     for i, start in enumerate(starts):
         log = dpc.simulate(
-            plant.plant,
+            dpc.systems.OscillatingMasses(),
             dpc.DPCController(layer, 10),
-            plant.y_ref,
+            torch.tensor(plant.y_ref),
             steps=y.shape[1],
-            u_ref=plant.u_ref,
+            u_ref=torch.tensor(plant.u_ref),
             attack=attack,
             reset={"state": start},
-            u_warmup=plant.u_ref,
+            u_warmup=torch.tensor(plant.u_ref),
         )
         torch.testing.assert_close(log.y, y[i], rtol=0, atol=1e-9)
-        error = error + plant.error(log.y, start)
+        error = error + plant.mean_errors(log.y, start)
     one_by_one = torch.autograd.grad(error, list(network.parameters()))
     for a, b in zip(batched, one_by_one, strict=True):
         assert relative(a, b) < 1e-6  # rounding grows on the way back through twenty plans
@@ -366,16 +363,16 @@ def run_script(out, *more, processes=1, **options):
     command = [
         sys.executable,
         *launch,
-        str(SCRIPTS / "train_adversary.py"),
+        "-m",
+        "scripts.train_adversary",
         "--quick",
         "--out",
         str(out),
         "--workers",
         "1",
     ]
-    path = os.pathsep.join([str(SCRIPTS.parent), os.environ.get("PYTHONPATH", "")])
-    environment = {**os.environ, "PYTHONPATH": path, "OMP_NUM_THREADS": "1"}
-    return {"args": [*command, *more], "env": environment, **options}
+    environment = {**os.environ, "OMP_NUM_THREADS": "1"}
+    return {"args": [*command, *more], "cwd": ROOT, "env": environment, **options}
 
 
 def weights(path):
@@ -431,9 +428,9 @@ def test_a_small_run_of_the_script(tmp_path):
 @pytest.mark.slow
 def test_flights_are_recorded_the_same_by_any_number_of_processes():
     pytest.importorskip("pybullet", reason="the quadrotor flies in PyBullet")
-    from _adversary_quadrotor import Quadrotor
+    from scripts.experiments.quadrotor import Quadrotor
 
-    one, two = (Quadrotor().record(3, 7, workers, every_step=False) for workers in (1, 2))
+    one, two = (Quadrotor().record_windows(3, 7, workers, every_step=False) for workers in (1, 2))
     for a, b in zip(one.tensors().values(), two.tensors().values(), strict=True):
         assert torch.equal(a, b)
     assert len(one) > 7 * 20 and torch.equal(one.step % 10, torch.zeros(len(one)).long())
@@ -442,15 +439,15 @@ def test_flights_are_recorded_the_same_by_any_number_of_processes():
 @pytest.mark.slow
 def test_the_linear_model_of_a_recording_flies_as_pybullet_does():
     pytest.importorskip("pybullet", reason="the quadrotor flies in PyBullet")
-    from _adversary_loop import TRAINING
-    from _adversary_quadrotor import Quadrotor, fly
+    from scripts.experiments.closed_loops import TRAINING
+    from scripts.experiments.quadrotor import Quadrotor, fly_lap
 
     plant = Quadrotor()
-    layer, start = plant.layer(TRAINING), torch.tensor([0])
+    layer, start = plant.planner(TRAINING), torch.tensor([0])
     for rho in plant.rhos:
-        attack = attacks.LinearizedAttack(layer, plant.cost, attacks.RelativeBall(rho))
+        attack = attacks.LinearizedAttack(layer, plant.target(), attacks.RelativeBall(rho))
         outputs, seen = plant.loop(layer, attack, start)
-        log, down = fly(layer, attack, 0, None)
+        log, down = fly_lap(plant, layer, attack, 0, None)
         flown = torch.linalg.vector_norm((log.y - log.y_ref)[:, :3], dim=1).mean().item()
-        assert not down.any() and plant.error(outputs, start).item() == pytest.approx(flown, rel=0.05)
+        assert not down.any() and plant.mean_errors(outputs, start).item() == pytest.approx(flown, rel=0.05)
         assert torch.equal(seen[seen.step == 30].y_ref[0], log.y_ref[30:55])

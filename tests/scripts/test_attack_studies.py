@@ -1,8 +1,5 @@
 """The studies of attacks: small runs, and what they claim about them."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -10,18 +7,15 @@ import torch
 pytest.importorskip("matplotlib", reason="the scripts draw with matplotlib")
 pytest.importorskip("tqdm", reason="the scripts show their progress with tqdm")
 
-SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-sys.path.insert(0, str(SCRIPTS))
 
-import _common as common  # noqa: E402
-import _surrogates  # noqa: E402
-import study_attacks  # noqa: E402
-import study_transfer  # noqa: E402
+from scripts import study_attacks, study_transfer
+from scripts.experiments import surrogates
+from scripts.shared.rows import read_rows
 
 FEW = {
     "everything": {},
     "other recording, 1 % noise": {"other": True, "noise": 1e-2},
-    "all of it off": _surrogates.SURROGATES["all of it off"],
+    "all of it off": surrogates.SURROGATES["all of it off"],
 }
 
 
@@ -33,16 +27,16 @@ def one_thread():
 
 
 def test_surrogates_differ_from_the_controller_in_what_they_say():
-    plant = _surrogates.load("masses", 0, 100)
-    victim = _surrogates.surrogate(plant)
-    other = _surrogates.surrogate(plant, other=True)
-    assert torch.equal(victim.data.Up, _surrogates.surrogate(plant, lambda_s=10.0).data.Up)
+    plant = surrogates.load("masses", 0, 100)
+    victim = surrogates.surrogate(plant)
+    other = surrogates.surrogate(plant, other=True)
+    assert torch.equal(victim.data.Up, surrogates.surrogate(plant, lambda_s=10.0).data.Up)
     assert not torch.equal(victim.data.Up, other.data.Up) and other.data.rank == victim.data.rank
-    assert _surrogates.surrogate(plant, lambda_s=10.0, lambda_g=0.1, Q=2.0).lambda_s == 1e7
-    assert _surrogates.surrogate(plant, n_g=150).data.n_g == 150
-    short = _surrogates.surrogate(plant, t_ini=4, horizon=10).data
+    assert surrogates.surrogate(plant, lambda_s=10.0, lambda_g=0.1, Q=2.0).lambda_s == 1e7
+    assert surrogates.surrogate(plant, n_g=150).data.n_g == 150
+    short = surrogates.surrogate(plant, t_ini=4, horizon=10).data
     assert (short.t_ini, short.horizon) == (4, 10)
-    noisy = _surrogates.surrogate(plant, noise=0.1).data.Yp
+    noisy = surrogates.surrogate(plant, noise=0.1).data.Yp
     spread = plant.own[1].std(0).repeat(6)
     assert torch.allclose((noisy - victim.data.Yp).std(1) / spread, torch.tensor(0.1).double(), rtol=0.15)
     u_held, y_held = plant.windows
@@ -56,7 +50,7 @@ def test_transfer_on_the_masses(tmp_path, monkeypatch):
     monkeypatch.setattr(study_transfer, "SEARCHES", (5, 50))
     monkeypatch.setattr(study_transfer, "PLANTS", ("masses", "masses"))  # the picture has two panels
     study_transfer.main(["--quick", "--workers", "1", "--out", str(tmp_path)])
-    rows = common.read_rows(tmp_path / "transfer.csv")
+    rows = read_rows(tmp_path / "transfer.csv")
 
     def share(knows, method, column="share"):
         return study_transfer.pick(rows, "masses", knows, method, column).mean()
@@ -80,7 +74,7 @@ def test_attacks_on_the_masses_are_never_worse_than_algorithm_1(tmp_path, monkey
     monkeypatch.setattr(study_attacks, "BUDGETS", few)
     monkeypatch.setattr(study_attacks, "IN_LOOP", (study_attacks.FIRST, "5 restarts"))
     study_attacks.main(["--quick", "--workers", "1", "--out", str(tmp_path)])
-    rows = common.read_rows(tmp_path / "attacks.csv")
+    rows = read_rows(tmp_path / "attacks.csv")
     assert len(rows["attack"]) == 2 * len(few) * len(study_attacks.ATTACKS)
     assert rows["worst"].max() < 1e-9 and rows["outside"].max() < 1e-9 and rows["unsolved"].sum() == 0
     first = rows["attack"] == study_attacks.FIRST
@@ -89,7 +83,7 @@ def test_attacks_on_the_masses_are_never_worse_than_algorithm_1(tmp_path, monkey
     assert (decrease[:, 1:] > decrease[:, :1] * (1 - 1e-9)).all() and (decrease[:, 1] > 1.001 * decrease[:, 0]).any()
     assert "| target input | Euclidean ball, rho |" in (tmp_path / "attacks.md").read_text()
 
-    runs = common.read_rows(tmp_path / "attacks_closed_loop.csv")
+    runs = read_rows(tmp_path / "attacks_closed_loop.csv")
     error = dict(zip(zip(runs["cost"], runs["attack"], strict=True), runs["error"], strict=True))
     assert error["-", "no attack"] < 1e-9 and error["tracking error", study_attacks.FIRST] < 1e-9
     assert error["-", "random noise"] < error["target input", study_attacks.FIRST]

@@ -1,8 +1,5 @@
 """The benchmark: its reference against central differences, one tiny row through a process of its own, resuming."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -12,15 +9,14 @@ import torch_dpc as dpc
 pytest.importorskip("matplotlib", reason="the scripts draw with matplotlib")
 pytest.importorskip("tqdm", reason="the scripts show their progress with tqdm")
 
-SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-sys.path.insert(0, str(SCRIPTS))
 
-import benchmark  # noqa: E402
-from _bench_cases import LOOP, Row, full_rows, inputs_of, layer_of, quick_rows, read_case, record, take  # noqa: E402
-from _bench_docs import refresh  # noqa: E402
-from _bench_report import write_report  # noqa: E402
-from _reference import HigherPrecision, eliminate, relative  # noqa: E402
-from baselines import PEERS  # noqa: E402
+from baselines import PEERS
+from scripts import benchmark
+from scripts.bench.cases import LOOP, Row, full_rows, inputs_of, layer_of, quick_rows, read_case, record, take
+from scripts.bench.docs import refresh
+from scripts.bench.higher_precision import HigherPrecision, eliminate, relative
+from scripts.bench.report import write_report
+from scripts.shared.command import ROOT
 
 SMALL = {"plant": "masses", "horizon": 5, "n_g": 60}
 STEP = 1e-6
@@ -139,7 +135,7 @@ def test_a_row_is_measured_in_its_own_process_saved_and_not_measured_again(tmp_p
 
 def test_a_row_that_hangs_or_crashes_is_reported_as_that(tmp_path, monkeypatch):
     program = tmp_path / "peer.py"
-    monkeypatch.setattr(benchmark, "__file__", str(program))
+    monkeypatch.setattr(benchmark, "PROGRAM", [str(program)])
     told = 'import time, os; print(\'noise\'); print(\'@row {"status": "ok", "setup_ms": 3.0}\', flush=True)\n'
     program.write_text(told + "time.sleep(60)")
     assert benchmark.in_a_process({"threads": 1}, limit=1.0) == {
@@ -204,7 +200,7 @@ def test_the_report_gives_ratios_to_the_fastest_peer_and_to_the_loop(tmp_path):
 def test_the_page_takes_every_measured_part_and_keeps_the_rest(tmp_path):
     page = tmp_path / "docs" / "benchmarks.md"
     (page.parent / "images").mkdir(parents=True)
-    page.write_text((SCRIPTS.parent / "docs" / "benchmarks.md").read_text())
+    page.write_text((ROOT / "docs" / "benchmarks.md").read_text())
     (tmp_path / "benchmark.png").write_bytes(b"a picture")
     (tmp_path / "table1_sizes.md").write_text("# Table I\n\n| CVXPYlayers | 1799 |\n")
     (tmp_path / "profile.md").write_text("# Profile\n\nmade with\n\n## Batch 1\n\n| DAQP | 1.0 |\n")

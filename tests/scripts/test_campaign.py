@@ -5,24 +5,23 @@ import signal
 import subprocess
 import sys
 import time
-from pathlib import Path
 
 import pytest
 
 for package in ("matplotlib", "tqdm", "joblib", "pyarrow"):
     pytest.importorskip(package, reason=f"campaigns need {package}: pip install '.[scripts,campaign]'")
 
-SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-sys.path.insert(0, str(SCRIPTS))
 
-import pyarrow.parquet as pq  # noqa: E402
+import pyarrow.parquet as pq
 
-import _campaign_config as config  # noqa: E402
-import campaign  # noqa: E402
-import figure3_masses  # noqa: E402
-from _campaign_backends import Backend, Lost, open_backend  # noqa: E402
-from _campaign_runs import run_chunk  # noqa: E402
-from _campaign_store import Store  # noqa: E402
+from scripts import campaign
+from scripts.campaigns import config
+from scripts.campaigns.backends import Backend, Lost, open_backend
+from scripts.campaigns.runs import run_chunk
+from scripts.campaigns.store import Store
+from scripts.experiments.case import run_seed
+from scripts.experiments.masses import Masses
+from scripts.shared.command import ROOT
 
 SMALL = """
 plants = ["masses"]
@@ -74,7 +73,7 @@ def test_rows_are_the_product_and_no_attack_comes_once(small):
     assert len(configs) == len({c.id for c in configs}) == ROWS
     assert sum(c.attack == "none" for c in configs) == 4 * 2
     assert {c.lambda_s for c in configs if c.weights == "strict"} == {1e7}
-    assert len(config.load(SCRIPTS / "campaigns" / "example.toml")) == 1000
+    assert len(config.load(ROOT / "scripts" / "campaigns" / "example.toml")) == 1000
 
 
 def test_the_id_is_that_of_the_run(small):
@@ -90,7 +89,7 @@ def test_the_id_is_that_of_the_run(small):
 
 
 def test_a_row_is_the_run_of_figure_3():
-    (run,) = [r for r in figure3_masses.run_seed(3, [0.1]) if r["attack"] == "algorithm1"]
+    (run,) = [r for r in run_seed(Masses(), 3, [0.1]) if r["attack"] == "algorithm1"]
     (row,) = run_chunk([config.RunConfig("masses", "paper", 3, "algorithm1", 0.1)])
     assert row["error"] == pytest.approx(run["error"].mean(), rel=1e-12)
     assert row["largest"] == pytest.approx(run["error"].max(), rel=1e-12)
@@ -157,8 +156,8 @@ def test_a_killed_campaign_goes_on_where_it_stopped(tmp_path):
     path = tmp_path / "long.toml"
     path.write_text(SMALL.replace("steps = 30", "steps = 200").replace("[3, 5, 8, 9]", "{first = 0, count = 12}"))
     configs, store = config.load(path), Store(tmp_path / "campaign_long")
-    command = [sys.executable, SCRIPTS / "campaign.py", path, "--out", tmp_path, "--workers", "1"]
-    first = subprocess.Popen(command, stderr=subprocess.DEVNULL, start_new_session=True)
+    command = [sys.executable, "-m", "scripts.campaign", path, "--out", tmp_path, "--workers", "1"]
+    first = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.DEVNULL, start_new_session=True)
     began = time.monotonic()
     while not store.parts() and time.monotonic() - began < 120:
         time.sleep(0.05)
@@ -167,7 +166,7 @@ def test_a_killed_campaign_goes_on_where_it_stopped(tmp_path):
     before = {part: (part.stat().st_mtime_ns, part.read_bytes()) for part in store.parts()}
     assert 0 < len(before) < 12
     (store.folder / "half.123.tmp").write_bytes(b"PAR1")  # what a kill in the middle of writing leaves
-    subprocess.run(command, stderr=subprocess.DEVNULL, check=True)
+    subprocess.run(command, cwd=ROOT, stderr=subprocess.DEVNULL, check=True)
     assert all((part.stat().st_mtime_ns, part.read_bytes()) == old for part, old in before.items())
     assert not list(store.folder.glob("*.tmp")) and is_complete(store, configs)
     table = pq.read_table(tmp_path / "campaign_long.parquet")
@@ -229,8 +228,9 @@ def test_ray_gives_the_same_rows(small, tmp_path):
     ray.init(num_cpus=2, include_dashboard=False, log_to_driver=False)
     try:
         address = ray.get_runtime_context().gcs_address
-        command = [sys.executable, SCRIPTS / "campaign.py", small, "--out", tmp_path]
-        subprocess.run([*command, "--backend", "ray", "--scheduler", address], stderr=subprocess.DEVNULL, check=True)
+        command = [sys.executable, "-m", "scripts.campaign", small, "--out", tmp_path]
+        command += ["--backend", "ray", "--scheduler", address]
+        subprocess.run(command, cwd=ROOT, stderr=subprocess.DEVNULL, check=True)
     finally:
         ray.shutdown()
     assert is_complete(Store(tmp_path / "campaign_small"), config.load(small))

@@ -2,8 +2,6 @@
 
 import json
 import math
-import sys
-from pathlib import Path
 
 import numpy as np
 import pytest
@@ -14,17 +12,15 @@ import torch_dpc as dpc
 pytest.importorskip("matplotlib", reason="the scripts draw with matplotlib")
 pytest.importorskip("tqdm", reason="the scripts show their progress with tqdm")
 
-SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-sys.path.insert(0, str(SCRIPTS))
 
-import _common as common  # noqa: E402
-import figure3_masses  # noqa: E402
-import figure4_quadrotor  # noqa: E402
-import recordings  # noqa: E402
-import report  # noqa: E402
-import study_sensitivity  # noqa: E402
-from _film import CAMERA, HEIGHT, WIDTH, project  # noqa: E402
-from _plots import percent  # noqa: E402
+import recordings
+from scripts import figure3_masses, report, study_sensitivity
+from scripts.experiments.quadrotor import LiesWhereItCrashed, Quadrotor
+from scripts.shared.command import run_all
+from scripts.shared.film import CAMERA, HEIGHT, WIDTH, project
+from scripts.shared.plots import percent
+from scripts.shared.rows import grid, read_rows, write_pgf, write_rows
+from scripts.shared.statistics import band, summarise
 
 SAME_FLIGHT = 1e-9  # [m, rad]: another processor may round PyBullet's arithmetic differently
 PIXEL = 1.5  # [pixels]
@@ -41,15 +37,15 @@ def runs(errors):
 
 
 def saved(tmp_path, errors):
-    common.write_rows(tmp_path / "rows.csv", runs(errors), "a note, with a comma")
-    return common.read_rows(tmp_path / "rows.csv")
+    write_rows(tmp_path / "rows.csv", runs(errors), "a note, with a comma")
+    return read_rows(tmp_path / "rows.csv")
 
 
 # --- files -----------------------------------------------------------------------------------------------------------
 
 
 def test_pgf_tables_have_the_form_the_papers_plots_read(tmp_path):
-    common.write_pgf(tmp_path / "a.csv", np.array([0.0, 0.1, 20.0]), [np.array([1.0, 2.0, 3.0]), np.ones(3) / 3])
+    write_pgf(tmp_path / "a.csv", np.array([0.0, 0.1, 20.0]), [np.array([1.0, 2.0, 3.0]), np.ones(3) / 3])
     assert (tmp_path / "a.csv").read_text() == "iter rho1 rho2\n0 1 0.333333\n0.1 2 0.333333\n20 3 0.333333\n"
 
 
@@ -57,8 +53,8 @@ def test_rows_come_back_as_they_were_written(tmp_path):
     rows = saved(tmp_path, {("nominal", 0.0): 0.1, ("random", 0.003): 1 / 3})
     assert (tmp_path / "rows.csv").read_text().startswith("# a note, with a comma\nseed,attack,rho,t,error\n0,nominal,")
     assert len(rows["t"]) == 2 * 2 * 3
-    np.testing.assert_allclose(common.grid(rows, "error", "random", 0.003), [[1 / 3] * 3, [2 / 3] * 3], rtol=1e-8)
-    np.testing.assert_allclose(common.grid(rows, "t", "nominal", 0.0), [[0, 0.1, 0.2]] * 2)
+    np.testing.assert_allclose(grid(rows, "error", "random", 0.003), [[1 / 3] * 3, [2 / 3] * 3], rtol=1e-8)
+    np.testing.assert_allclose(grid(rows, "t", "nominal", 0.0), [[0, 0.1, 0.2]] * 2)
 
 
 # --- statistics ------------------------------------------------------------------------------------------------------
@@ -66,7 +62,7 @@ def test_rows_come_back_as_they_were_written(tmp_path):
 
 def test_band_is_the_median_and_two_percentiles_over_the_seeds():
     values = np.arange(11.0)[:, None] * [1.0, -1.0]  # 0 ... 10 and 0 ... -10
-    median, low, high = common.band(values)
+    median, low, high = band(values)
     np.testing.assert_allclose(median, [5, -5])
     np.testing.assert_allclose(low, [1, -9])
     np.testing.assert_allclose(high, [9, -1])
@@ -74,7 +70,7 @@ def test_band_is_the_median_and_two_percentiles_over_the_seeds():
 
 def test_summary_compares_errors_and_added_errors(tmp_path):
     rows = saved(tmp_path, {("nominal", 0.0): 0.1, ("random", 0.01): 0.2, ("algorithm1", 0.01): 0.6})
-    summary = common.summarise(rows, [0.01])
+    summary = summarise(rows, [0.01])
     (level,) = summary["levels"]
     assert summary["nominal"]["mean"] == pytest.approx(0.15)
     assert level["ratio"] == pytest.approx(3.0)
@@ -85,7 +81,7 @@ def test_summary_compares_errors_and_added_errors(tmp_path):
 
 def test_summary_gives_no_ratio_where_random_noise_adds_nothing(tmp_path):
     rows = saved(tmp_path, {("nominal", 0.0): 0.1, ("random", 0.01): 0.09, ("algorithm1", 0.01): 0.6})
-    (level,) = common.summarise(rows, [0.01])["levels"]
+    (level,) = summarise(rows, [0.01])["levels"]
     assert level["added_ratio"] is None and level["added_ratio_by_seed"] is None
     assert report.times(level["added_ratio"], level["added_ratio_by_seed"]) == "random adds nothing"
 
@@ -100,16 +96,16 @@ def test_percent_and_first_failure_read_well():
 
 def test_jobs_come_back_in_order_whatever_the_number_of_processes():
     jobs = [(float(i),) for i in range(4)]
-    assert common.run_all(math.sqrt, jobs, 1, "one") == [math.sqrt(i) for i in range(4)]
-    assert common.run_all(math.sqrt, jobs, 2, "two") == [math.sqrt(i) for i in range(4)]
+    assert run_all(math.sqrt, jobs, 1, "one") == [math.sqrt(i) for i in range(4)]
+    assert run_all(math.sqrt, jobs, 2, "two") == [math.sqrt(i) for i in range(4)]
 
 
 # --- the experiments -------------------------------------------------------------------------------------------------
 
 
 def test_circle_is_the_papers():
-    reference = figure4_quadrotor.circle(251)
-    offset = reference[:, :3] - figure4_quadrotor.CENTRE
+    reference = Quadrotor().circle(251)
+    offset = reference[:, :3] - Quadrotor().centre
     np.testing.assert_allclose(torch.linalg.vector_norm(offset, dim=1), 0.3, rtol=1e-12)
     np.testing.assert_allclose(reference[250], reference[0], atol=1e-12)  # 10 s later
     assert (reference[:, 2] == 1).all() and (reference[:, 3:] == 0).all()
@@ -128,7 +124,7 @@ def test_a_crashed_vehicle_lies_where_it_crashed():
             self.crashed = self.height <= 1.0
             return torch.tensor([self.height])
 
-    plant = figure4_quadrotor.LiesWhereItCrashed(Faller())
+    plant = LiesWhereItCrashed(Faller())
     plant.reset()
     assert [float(plant.step(0.0)) for _ in range(4)] == [2.0, 1.0, 1.0, 1.0]
     assert plant.down == [False, True, True, True]
@@ -151,7 +147,7 @@ def test_figure3_runs_and_leaves_its_files(tmp_path, capsys):
 
     report.main(["--out", str(tmp_path)])
     text = (tmp_path / "report.md").read_text()
-    assert "figure3_masses.png" in text and "Not made: run `python scripts/figure4_quadrotor.py`" in text
+    assert "figure3_masses.png" in text and "Not made: run `python -m scripts.figure4_quadrotor`" in text
 
 
 # --- the stored flight -----------------------------------------------------------------------------------------------
@@ -159,11 +155,12 @@ def test_figure3_runs_and_leaves_its_files(tmp_path, capsys):
 
 def test_recorded_flight_excites_the_quadrotor_and_algorithm_1_works_on_it():
     u, y = recordings.quadrotor_recording()
-    layer = figure4_quadrotor.planner(u, y)
+    case = Quadrotor()
+    layer = case.layer(case.hankel(u, y))
     assert layer.data.n_g == 500 and layer.data.rank == layer.data.Up.shape[0] + 31 * 6 + 25 * 3
     window = (u[100:106], y[100:106])
-    references = {"y_ref": figure4_quadrotor.circle(25)}
-    cost = dpc.attacks.TargetInput(figure4_quadrotor.TARGET)
+    references = {"y_ref": case.circle(25)}
+    cost = case.target()
     budget = dpc.attacks.RelativeBall(0.003)
     p = dpc.attacks.LinearizedAttack(layer, cost, budget)(*window, **references)
     noise = dpc.attacks.RandomAttack(budget)(window[1], window[1], generator=torch.Generator().manual_seed(0))

@@ -1,8 +1,5 @@
 """The study of streams: its plants, its measurements in small, and a controller whose plant changes."""
 
-import sys
-from pathlib import Path
-
 import numpy as np
 import pytest
 import torch
@@ -13,10 +10,9 @@ pytest.importorskip("matplotlib", reason="the scripts draw with matplotlib")
 pytest.importorskip("tqdm", reason="the scripts show their progress with tqdm")
 pytest.importorskip("safetensors", reason="saving needs safetensors")
 
-sys.path.insert(0, str(Path(__file__).resolve().parents[2] / "scripts"))
 
-import _stream_adaptation as adaptation  # noqa: E402
-import study_stream  # noqa: E402
+from scripts import study_stream
+from scripts.experiments import stream_adaptation as adaptation
 
 
 @pytest.mark.parametrize(("name", "order", "n_u"), [("masses", 4, 2), ("quadrotor", 12, 3)])

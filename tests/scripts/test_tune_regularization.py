@@ -1,24 +1,20 @@
 """The tuning script: tables that survive kills, cases that are the figures', and the files a short run leaves."""
 
-import sys
-from pathlib import Path
-
 import pytest
 import torch
 
 for package in ("matplotlib", "tqdm", "joblib"):
     pytest.importorskip(package, reason=f"the script needs {package}: pip install '.[scripts]'")
 
-SCRIPTS = Path(__file__).resolve().parents[2] / "scripts"
-sys.path.insert(0, str(SCRIPTS))
 
-import _tuning_report as report  # noqa: E402
-import figure3_masses  # noqa: E402
-import tune_regularization as script  # noqa: E402
-from _case import Weights  # noqa: E402
-from _cases import CASES, MovingTarget  # noqa: E402
-from _tables import Table, as_they_finish  # noqa: E402
-from torch_dpc import tuning  # noqa: E402
+from scripts import tune_regularization as script
+from scripts.experiments.all_cases import CASES
+from scripts.experiments.case import Weights, run_seed
+from scripts.experiments.masses import Masses, MovingTarget
+from scripts.regularization import report
+from scripts.regularization.objectives import objectives
+from scripts.shared.tables import Table, as_they_finish
+from torch_dpc import tuning
 
 
 def test_a_table_keeps_whole_lines_only(tmp_path):
@@ -54,7 +50,7 @@ def test_only_what_is_missing_is_run_again():
 
 
 def test_the_masses_run_as_in_figure_3():
-    (figure,) = [r for r in figure3_masses.run_seed(1, [0.1]) if r["attack"] == "algorithm1"]
+    (figure,) = [r for r in run_seed(Masses(), 1, [0.1]) if r["attack"] == "algorithm1"]
     case = CASES["held"]
     with case.system() as plant:
         run = case.run(plant, case.layer(case.data(plant, 1), case.paper()), 1, "algorithm1", 0.1)
@@ -65,12 +61,12 @@ def test_windows_continue_as_the_run_did():
     """The objective's first plan of a window is the plan of the closed loop there, attack and all."""
     case = CASES["held"]
     with case.system() as plant:
-        objective = case.objectives(plant, case.paper())[0]
+        objective = objectives(case, plant, case.paper())[0]
     scales = tuning.WeightScales(objective.layer)
     nominal, attacked = objective.costs(scales)
     half = len(nominal) // 2  # windows of the run without attack come first, at rest on the reference
     assert nominal[:half].max() < 1e-6 < attacked[:half].min()
-    assert (objective.y_ref == figure3_masses.Y_REF).all()
+    assert (objective.y_ref == torch.tensor(case.y_ref)).all()
 
 
 def test_a_moving_target_is_the_attackers_at_each_start():

@@ -1,0 +1,1 @@
+"""Trained adversaries: losses, training, judging and report."""

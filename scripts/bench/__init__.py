@@ -1,0 +1,1 @@
+"""The benchmark: its problems, rows, reference in higher precision, and report."""

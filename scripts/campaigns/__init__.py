@@ -1,0 +1,1 @@
+"""Campaigns: configuration, runs, engines, store and picture."""

@@ -1,0 +1,1 @@
+"""Tuned weights: searches, judging and report."""

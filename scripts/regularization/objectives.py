@@ -1,0 +1,89 @@
+"""What tuning minimises: one objective for each training recording, on windows of closed-loop runs.
+
+Four kinds of recordings have seeds far apart: those tuned on, those behind the predictor that judges plans, those by
+which one point is chosen, and the held-out ones by which it is judged.
+"""
+
+from __future__ import annotations
+
+import functools
+from dataclasses import replace
+from typing import Any
+
+import torch
+from torch import Tensor
+
+import torch_dpc as dpc
+from scripts.experiments.case import Case, Weights
+from scripts.experiments.masses import Masses, MovingTarget
+from scripts.shared.statistics import NOMINAL, POISON
+from torch_dpc import tuning
+
+TRAINING, PREDICTOR, VALIDATION = (100, 101, 102), (200, 201, 202, 203), (110, 111, 112, 113, 114, 115)
+HELD_OUT_FROM = 300
+WINDOW_EVERY = 50  # steps between the windows that are cut from a run
+PLANS = {"masses": 10, "quadrotor": 8}  # of a run in the objective, `replan_every` steps each
+#: The paper's weight of the attitude is 0, whose logarithm cannot move: tuning starts from this one.
+ATTITUDE = 1.0  # [1/rad^2], beside 10 / m^2 on the position
+
+
+def start(case: Case) -> Weights:
+    """Return the weights at which tuning starts: the paper's, and `ATTITUDE` where they are 0."""
+    paper = case.paper()
+    return paper._replace(Q=tuple(q or ATTITUDE for q in paper.Q))
+
+
+def objectives(case: Case, plant: Any, weights: Weights, **options: Any) -> list[tuning.RobustObjective]:
+    """Return one objective for each training recording, on windows of closed-loop runs with the paper's weights."""
+    predictor, recordings = _prepared(case, plant)
+    budget = dpc.attacks.RelativeBall(case.rho)
+    return [
+        tuning.RobustObjective(
+            case.layer(data, weights),
+            windows,
+            budget,
+            psi=_windows_target(case, starts),
+            predictor=predictor,
+            cost=tuning.MeanError(case.channels),
+            plans=PLANS[case.plant],
+            replan_every=case.replan_every,
+            **options,
+        )
+        for data, windows, starts in recordings
+    ]
+
+
+@functools.cache
+def _prepared(case: Case, plant: Any) -> Any:
+    """Return the predictor that judges, and the data, windows and starts of each training recording; made once."""
+    recordings = [case.record(plant, seed) for seed in PREDICTOR]
+    pooled = case.hankel(*map(list, zip(*recordings, strict=True)))
+    training = []
+    for seed in TRAINING:
+        data = case.data(plant, seed)
+        training.append((data, *_windows(case, plant, case.layer(data), seed)))
+    return tuning.DataPredictor(pooled), training
+
+
+def _windows(case: Case, plant: Any, layer: dpc.DPCLayer, seed: int) -> tuple[tuning.Windows, Tensor]:
+    """Return windows from a run without and one under attack, and the steps at which their plans begin."""
+    t_ini = case.t_ini
+    kept = slice(t_ini, case.steps, WINDOW_EVERY)
+    starts = torch.arange(case.steps)[kept]
+    pieces = []
+    for kind in (NOMINAL, POISON):
+        log = case.simulate(plant, layer, seed, case.attack(kind, case.rho, layer))
+        pieces += [(log.u[k - t_ini : k], log.y[k - t_ini : k]) for k in starts.tolist()]
+    u_ini, y_ini = (torch.stack(part) for part in zip(*pieces, strict=True))
+    starts = starts.repeat(2)
+    length = PLANS[case.plant] * case.replan_every + case.horizon
+    rows = starts[:, None] + torch.arange(length)
+    y_ref, u_ref = case.references(int(rows.max()) + 1)
+    return tuning.Windows(u_ini, y_ini, y_ref[rows], None if u_ref is None else u_ref[rows]), starts
+
+
+def _windows_target(case: Case, starts: Tensor) -> Any:
+    """Return what the paper's attacker wants of a batch of windows that start at different steps of a run."""
+    if not isinstance(case, Masses):
+        return case.target()
+    return MovingTarget(replace(case, steps=2 * case.steps).wanted(), starts)
