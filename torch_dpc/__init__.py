@@ -1,6 +1,15 @@
 """Differentiable data-driven predictive control for PyTorch, and attacks on it."""
 
 from . import attacks, systems, tuning
+from .attacks import (
+    BallBudget,
+    BoxBudget,
+    EllipsoidBudget,
+    L1BallBudget,
+    PerChannelBudget,
+    RelativeBallBudget,
+    SparseBallBudget,
+)
 from .control.controller import DPCController
 from .control.log import ClosedLoopLog
 from .control.simulation import simulate
@@ -19,26 +28,33 @@ __version__ = "0.1.0"
 
 __all__ = [
     "Ball",
+    "BallBudget",
     "Box",
+    "BoxBudget",
     "ClosedLoopLog",
     "CompactForm",
     "ConvexSet",
     "DPCController",
     "DPCLayer",
     "DPCSolution",
+    "EllipsoidBudget",
     "ExcitationWarning",
     "HankelBatch",
     "HankelData",
     "HankelStream",
     "InfeasibleError",
+    "L1BallBudget",
     "NonNegative",
+    "PerChannelBudget",
     "Plant",
     "Product",
     "Reals",
+    "RelativeBallBudget",
     "SecondOrderCone",
     "SoftBox",
     "SolveError",
     "SolveInfo",
+    "SparseBallBudget",
     "Status",
     "attacks",
     "collect",

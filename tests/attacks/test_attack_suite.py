@@ -14,8 +14,9 @@ import torch_dpc as dpc
 from helpers import HOLDING, Y_REF, generator, paper_layer, randn, relative, small_layer, windows
 from recordings import quadrotor_recording
 from torch_dpc import attacks
-from torch_dpc.attacks.gradient import checked, psi_and_gradient
-from torch_dpc.attacks.loop import PATIENCE
+from torch_dpc.attacks.base import within_budget
+from torch_dpc.attacks.loop import SETTINGS
+from torch_dpc.attacks.objective import psi_and_gradient
 
 EXACT = 1e-10
 INSIDE = 1e-9  # the promise
@@ -221,7 +222,7 @@ def test_samples_without_a_gradient_or_progress_leave_the_batch():
         return 100.0 + noise[0] + sol.u.sum((-2, -1))
 
     attacks.ProjectedGradientAttack(stuck, only_gets_worse, attacks.Ball(1e-3), steps=100)(u_ini, y_ini)
-    assert len(stuck.sizes) <= PATIENCE + 2
+    assert len(stuck.sizes) <= SETTINGS.patience + 2
 
 
 def test_samples_without_a_plan_leave_at_once():
@@ -312,9 +313,9 @@ def test_an_attack_that_leaves_its_budget_is_caught():
     with pytest.raises(AssertionError, match="left its budget by 1"):
         attacks.ProjectedGradientAttack(layer, cost, Leaky(0.1))(u_ini, y_ini, **refs)
     p = attacks.Ball(0.1).random(y_ini, generator())
-    assert torch.equal(checked(p, y_ini, attacks.Ball(0.1)), p)
+    assert torch.equal(within_budget(p, y_ini, attacks.Ball(0.1)), p)
     with pytest.raises(AssertionError, match="left its budget"):
-        checked(p, y_ini, attacks.Ball(0.1 * (1 - 1e-8)))
+        within_budget(p, y_ini, attacks.Ball(0.1 * (1 - 1e-8)))
 
 
 def test_a_budget_of_ones_own_needs_two_methods():

@@ -7,6 +7,7 @@ import pytest
 import torch
 from scipy.optimize import LinearConstraint, NonlinearConstraint, minimize
 
+import torch_dpc as dpc
 from helpers import generator, nearest_point, randn, relative
 from torch_dpc import attacks
 
@@ -306,3 +307,15 @@ def test_a_bad_number_of_sensors_is_named(channels):
 def test_what_has_no_radius_a_channel_is_refused(inner):
     with pytest.raises(ValueError, match="must be a Ball, RelativeBall or L1Ball"):
         attacks.PerChannel(inner)
+
+
+# --- names ------------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("name", ["Ball", "Box", "Ellipsoid", "L1Ball", "PerChannel", "RelativeBall", "SparseBall"])
+def test_a_short_name_is_the_same_class_and_the_long_one_is_at_top_level(name):
+    assert getattr(attacks, name) is getattr(attacks, name + "Budget") is getattr(dpc, name + "Budget")
+
+
+def test_a_budget_shows_its_size():
+    assert repr(attacks.RelativeBall(0.1)) == "RelativeBallBudget(radius=0.1, relative=True, rho=0.1)"

@@ -1,34 +1,56 @@
 """Attacks on the measurements: costs, budgets, and how to choose a perturbation."""
 
 from ..data.predictor import Predictor
-from .budgets import Ball, Box, Budget, Ellipsoid, L1Ball, PerChannel, RelativeBall, SparseBall
+from .base import Attack, Planner
+from .budgets import (
+    BallBudget,
+    BoxBudget,
+    Budget,
+    EllipsoidBudget,
+    L1BallBudget,
+    PerChannelBudget,
+    RelativeBallBudget,
+    SparseBallBudget,
+)
 from .costs import Cost, TargetInput, TrackingError
-from .gradient import LinearizedAttack
-from .iterative import FrankWolfeAttack, ProjectedGradientAttack
-from .network import AttackPolicy
-from .policy import PolicyAttack
+from .gradient import FrankWolfeAttack, LinearizedAttack, ProjectedGradientAttack
+from .policy import AttackPolicy, PolicyAttack
 from .query import FiniteDifferenceAttack, RandomSearchAttack
 from .random import RandomAttack
 
+# Short names, as in `attacks.Ball(0.1)`: the same classes.
+Ball, Box, Ellipsoid = BallBudget, BoxBudget, EllipsoidBudget
+L1Ball, PerChannel = L1BallBudget, PerChannelBudget
+RelativeBall, SparseBall = RelativeBallBudget, SparseBallBudget
+
 __all__ = [
+    "Attack",
     "AttackPolicy",
     "Ball",
+    "BallBudget",
     "Box",
+    "BoxBudget",
     "Budget",
     "Cost",
     "Ellipsoid",
+    "EllipsoidBudget",
     "FiniteDifferenceAttack",
     "FrankWolfeAttack",
     "L1Ball",
+    "L1BallBudget",
     "LinearizedAttack",
     "PerChannel",
+    "PerChannelBudget",
+    "Planner",
     "PolicyAttack",
     "Predictor",
     "ProjectedGradientAttack",
     "RandomAttack",
     "RandomSearchAttack",
     "RelativeBall",
+    "RelativeBallBudget",
     "SparseBall",
+    "SparseBallBudget",
     "TargetInput",
     "TrackingError",
 ]

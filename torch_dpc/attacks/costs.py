@@ -13,12 +13,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..checks import as_data
+from ..checks import as_data, last_rows, to_horizon
 from ..data.hankel import HankelData
 from ..data.predictor import Predictor
 from ..problem.weights import weight_matrix
 from ..solution import DPCSolution
-from .references import last_rows, to_horizon
 
 #: A cost of a plan, `(*batch,)`; any callable will do.
 Cost = Callable[[DPCSolution], Tensor]

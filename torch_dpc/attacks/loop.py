@@ -12,16 +12,22 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..checks import as_data
-from ..layer import DPCLayer
+from .base import Attack, AttackCall, Planner
 from .budgets import Budget
-from .objective import Objective, checked
+from .objective import Objective
 
-#: A step that promises to change psi by less than this fraction is rounding, and is not taken; a change of psi by less
-#: than this fraction is no improvement.
-NOISE_FLOOR = 1e-10
-#: A sample whose psi has not improved for this many steps in a row is left where it was best.
-PATIENCE = 6
+
+@dataclass(frozen=True)
+class WalkSettings:
+    """Constants of the attacks by gradient."""
+
+    noise_floor: float = 1e-10  # relative change of psi that is rounding: no step is taken for it, no answer kept
+    patience: int = 6  # steps in a row without an improvement after which a sample stops
+    shorter: float = 0.5  # factor on the step size of projected gradient after a step that did not improve psi
+    longer: float = 1.5  # factor after one that did
+
+
+SETTINGS = WalkSettings()
 
 
 @dataclass
@@ -70,10 +76,22 @@ class Walk:
 
 def improves(psi: Tensor, least: Tensor) -> Tensor:
     """Return whether psi is below the least so far by more than rounding."""
-    return psi < torch.where(least.isfinite(), least - NOISE_FLOOR * least.abs(), least)
+    return psi < torch.where(least.isfinite(), least - SETTINGS.noise_floor * least.abs(), least)
 
 
-class IterativeAttack:
+def algorithm_1_step(budget: Budget, y_ini: Tensor, p: Tensor, psi: Tensor, gradient: Tensor) -> Tensor:
+    """Return argmin over the budget of <gradient, .>: Algorithm 1's step.
+
+    A sample stays at p where there is no plan, or where the step promises no more than rounding: there a direction
+    would be rounding amplified to the size of the budget.
+    """
+    vertex = budget.minimize_linear(gradient, y_ini)
+    promised = (gradient * vertex).sum((-2, -1)).abs()
+    worthwhile = promised > SETTINGS.noise_floor * psi.abs()  # never where psi is infinite
+    return torch.where(worthwhile[..., None, None], vertex, p)
+
+
+class IterativeAttack(Attack):
     """The loop: start, linearise, step, keep the best.
 
     Args:
@@ -87,43 +105,26 @@ class IterativeAttack:
     #: Whether a step that does not improve psi is taken back, so that the next one starts from the best.
     takes_back = False
 
-    def __init__(self, layer: DPCLayer, cost: Any, budget: Budget, steps: int = 20, *, restarts: int = 1):
+    def __init__(self, layer: Planner, cost: Any, budget: Budget, steps: int = 20, *, restarts: int = 1):
         if not isinstance(steps, int) or isinstance(steps, bool) or steps < 0:
             raise ValueError(f"`steps` must be an integer, 0 or more, got {steps!r}.")
         if not isinstance(restarts, int) or isinstance(restarts, bool) or restarts < 1:
             raise ValueError(f"`restarts` must be an integer, 1 or more, got {restarts!r}.")
-        self.layer, self.cost, self.budget = layer, cost, budget
+        super().__init__(budget)
+        self.layer, self.cost = layer, cost
         self.steps, self.restarts = steps, restarts
 
-    def __call__(
-        self,
-        u_ini: Any,
-        y_ini: Any,
-        *,
-        y_ref: Any = None,
-        u_ref: Any = None,
-        generator: torch.Generator | None = None,
-        step: int = 0,
-    ) -> Tensor:
-        """Return p, the shape and dtype of y_ini; the call of every attack.
-
-        Args:
-            u_ini, y_ini: the true windows, `(*batch, t_ini, n)`.
-            y_ref, u_ref: references, as the layer takes them.
-            generator: of the random starts; unused where there are none.
-            step: of the run, for costs that move with it.
-        """
-        y_ini = as_data("y_ini", y_ini)
-        objective = self._objective(u_ini, y_ini, y_ref, u_ref, step, generator=generator)
+    def _perturb(self, call: AttackCall) -> Tensor:
+        objective = self._objective(call)
         for restart in range(self.restarts):
-            walk = self._walk(objective, self._start(restart, objective.y_ini, generator), restart == 0)
+            walk = self._walk(objective, self._start(restart, objective.y_ini, call.generator), restart == 0)
             if restart == 0:
                 p, least = walk.best_p, walk.best_psi
             else:
                 better = improves(walk.best_psi, least)
                 p = torch.where(better[..., None, None], walk.best_p, p)
                 least = torch.where(better, walk.best_psi, least)
-        return checked(p.to(y_ini.dtype), y_ini, self.budget)
+        return p
 
     def _walk(self, objective: Objective, start: Tensor, is_first: bool) -> Walk:
         """Go from one start; a sample whose gradient is at the floor, or whose psi stalls, leaves the batch."""
@@ -135,12 +136,12 @@ class IterativeAttack:
                 walk.return_to_best()
             vertex = self.budget.minimize_linear(walk.gradient, objective.y_ini)
             promised = (walk.gradient * (walk.p - vertex)).sum((-2, -1))
-            floor = torch.where(walk.psi.isfinite(), NOISE_FLOOR * walk.psi.abs(), torch.inf)
-            active = active & (promised > floor) & (walk.stalls < PATIENCE)
+            floor = torch.where(walk.psi.isfinite(), SETTINGS.noise_floor * walk.psi.abs(), torch.inf)
+            active = active & (promised > floor) & (walk.stalls < SETTINGS.patience)
             if not bool(active.any()):
                 return walk
             if is_first and k == 0:
-                moved = vertex  # Algorithm 1
+                moved = algorithm_1_step(self.budget, objective.y_ini, walk.p, walk.psi, walk.gradient)
             else:
                 step = self._direction(walk, vertex, objective.y_ini, k)
                 moved = self._project(walk.p + step, objective.y_ini)
@@ -165,6 +166,6 @@ class IterativeAttack:
             walk.see(objective.psi(walk.p, active), walk.gradient)
         return walk
 
-    def _objective(self, *call: Any, generator: torch.Generator | None) -> Objective:
-        """Return what is minimised in a call with (u_ini, y_ini, y_ref, u_ref, step)."""
-        return Objective(self.layer, self.cost, *call)
+    def _objective(self, call: AttackCall) -> Objective:
+        """Return what is minimised in a call."""
+        return Objective(self.layer, self.cost, call.u_ini, call.y_ini, call.y_ref, call.u_ref, call.step)

@@ -1,23 +1,20 @@
-"""What an attack minimises, psi(u*(p)), with its gradient through the layer, and the check of every answer."""
+"""What an attack minimises, psi(u*(p)), with its gradient through the layer."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import replace
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from ..checks import as_data
+from ..checks import as_data, last_rows, to_horizon
 from ..errors import Status
 from ..layer import DPCLayer
 from ..solution import DPCSolution, SolveInfo
-from .budgets import Budget
+from .base import Planner
 from .costs import bound
-from .references import last_rows, to_horizon
-
-#: How far outside its budget a perturbation may be, relative to the budget's size, before it is a defect.
-BUDGET_TOLERANCE = 1e-9
 
 
 class Objective:
@@ -32,19 +29,32 @@ class Objective:
         u_ini, y_ini: the true windows, `(*batch, t_ini, n)`.
         y_ref, u_ref: references, as the layer takes them.
         step: of the run.
+        keeps_graph: whether gradients carry the graph of the windows, of p and of the layer's weights.
 
     Raises:
         ValueError: shapes that do not fit.
     """
 
-    def __init__(self, layer: Any, cost: Any, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any, step: int):
-        with torch.inference_mode(False):  # what inference mode made cannot enter a graph
-            u_ini, y_ini = (
-                as_data(name, w).detach().double().clone() for name, w in (("u_ini", u_ini), ("y_ini", y_ini))
-            )
+    def __init__(
+        self,
+        layer: Planner,
+        cost: Any,
+        u_ini: Any,
+        y_ini: Any,
+        y_ref: Any,
+        u_ref: Any,
+        step: int,
+        *,
+        keeps_graph: bool = False,
+    ):
+        u_ini, y_ini = as_data("u_ini", u_ini).double(), as_data("y_ini", y_ini).double()
+        if not keeps_graph:
+            with torch.inference_mode(False):  # what inference mode made cannot enter a graph
+                u_ini, y_ini = u_ini.detach().clone(), y_ini.detach().clone()
         if y_ini.ndim < 2:
             raise ValueError(f"`y_ini` must have shape (*batch, t_ini, n_y), got {tuple(y_ini.shape)}.")
-        self.layer, self.y_ini, self.batch = layer, y_ini, y_ini.shape[:-2]
+        self.layer: Callable[..., Any] = layer
+        self.y_ini, self.batch, self.keeps_graph = y_ini, y_ini.shape[:-2], keeps_graph
         self.u_ini = _of_batch("u_ini", u_ini, self.batch)
         data = getattr(layer, "data", None)
         horizon = None if data is None else data.horizon
@@ -75,10 +85,13 @@ class Objective:
     def gradient(self, p: Tensor, of: Tensor | None = None) -> tuple[Tensor, Tensor]:
         """Return psi and its gradient in p, zero where there is no plan and for samples not asked for."""
         with torch.inference_mode(False), torch.enable_grad():
-            p = p.detach().clone().requires_grad_()
+            if not (self.keeps_graph and p.requires_grad):
+                p = p.detach().clone().requires_grad_()
             psi = self.psi(p, of)
             total = torch.where(psi.isfinite(), psi, 0.0).sum()
-            (gradient,) = torch.autograd.grad(total, p) if total.requires_grad else (torch.zeros_like(p),)
+            gradient = torch.zeros_like(p)
+            if total.requires_grad:
+                (gradient,) = torch.autograd.grad(total, p, create_graph=self.keeps_graph)
         psi = psi.detach()
         return psi, torch.where(psi.isfinite()[..., None, None], gradient, 0.0)
 
@@ -113,7 +126,7 @@ class Objective:
 
 
 def is_everyone(of: Tensor | None) -> bool:
-    """Return whether a choice of samples leaves nobody out."""
+    """Return whether a choice of samples contains every sample."""
     return of is None or bool(of.all())
 
 
@@ -122,25 +135,6 @@ def psi_and_gradient(
 ) -> tuple[Tensor, Tensor]:
     """Return psi(u*(p)), `(*batch,)`, and its gradient in p; infinity and 0 where there is no plan."""
     return Objective(layer, cost, u_ini, y_ini, y_ref, u_ref, step).gradient(p.double())
-
-
-def checked(p: Tensor, y_ini: Tensor, budget: Budget) -> Tensor:
-    """Return p, after a look at the budget by someone other than the attack, in float64.
-
-    A p of lower precision may be outside by the rounding of its own entries; it is drawn in by that much.
-
-    Raises:
-        AssertionError: p is outside its budget by more than 1e-9 of the budget's size.
-    """
-    excess = budget.excess(p.detach().double(), y_ini.detach().double())
-    if p.dtype != torch.float64:
-        eps = torch.finfo(p.dtype).eps
-        outside = (excess > 0) & (excess <= 10 * eps)
-        p = torch.where(outside[..., None, None], p * (1 - excess[..., None, None] - 2 * eps).to(p.dtype), p)
-        excess = budget.excess(p.detach().double(), y_ini.detach().double())
-    if not bool((excess <= BUDGET_TOLERANCE).all()):
-        raise AssertionError(f"the attack left its budget by {float(excess.max()):.1e} of its size.")
-    return p
 
 
 def _of_batch(name: str, value: Tensor, batch: torch.Size) -> Tensor:

@@ -14,12 +14,14 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..checks import as_data, check_count
+from ..checks import check_count
 from ..layer import DPCLayer
-from .budget_base import Budget, standard_normal
-from .iterative import ProjectedGradientAttack
+from .base import Attack, AttackCall, Planner
+from .budgets import Budget
+from .budgets.base import standard_normal
+from .gradient import ProjectedGradientAttack
 from .loop import improves
-from .objective import Objective, checked, is_everyone
+from .objective import Objective, is_everyone
 
 
 class SeenPlan(NamedTuple):
@@ -31,8 +33,8 @@ class SeenPlan(NamedTuple):
 class BlackBox:
     """A controller that is only asked, and how often: `n_queries` windows so far."""
 
-    def __init__(self, controller: Callable[..., Any]):
-        self._controller = controller
+    def __init__(self, controller: Planner):
+        self._controller: Callable[..., Any] = controller
         self._options = {"on_failure": "nan"} if isinstance(controller, DPCLayer) else {}
         self.n_queries = 0
 
@@ -147,7 +149,7 @@ class FiniteDifferenceAttack(ProjectedGradientAttack):
 
     def __init__(
         self,
-        controller: Callable[..., Any],
+        controller: Planner,
         cost: Any,
         budget: Budget,
         steps: int = 0,
@@ -156,7 +158,8 @@ class FiniteDifferenceAttack(ProjectedGradientAttack):
         directions: int | None = None,
         **options: Any,
     ):
-        super().__init__(BlackBox(controller), cost, budget, steps, **options)  # type: ignore[arg-type]
+        self.controller = BlackBox(controller)
+        super().__init__(self.controller, cost, budget, steps, **options)
         if not probe > 0:
             raise ValueError(f"`probe` must be positive, got {probe!r}.")
         if directions is not None:
@@ -166,14 +169,21 @@ class FiniteDifferenceAttack(ProjectedGradientAttack):
     @property
     def n_queries(self) -> int:
         """Windows asked for so far, by all calls."""
-        return self.layer.n_queries  # type: ignore[return-value]
+        return self.controller.n_queries
 
-    def _objective(self, *call: Any, generator: torch.Generator | None) -> Objective:
-        options = {"probe": self.probe, "directions": self.directions, "generator": generator}
-        return QueryObjective(self.layer, self.cost, *call, **options)  # type: ignore[arg-type]
+    def _objective(self, call: AttackCall) -> Objective:
+        problem = (call.u_ini, call.y_ini, call.y_ref, call.u_ref, call.step)
+        return QueryObjective(
+            self.controller,
+            self.cost,
+            *problem,
+            probe=self.probe,
+            directions=self.directions,
+            generator=call.generator,
+        )
 
 
-class RandomSearchAttack:
+class RandomSearchAttack(Attack):
     """Accept if better: a random step from the best perturbation so far, kept when the controller's answer says so.
 
     The size of a sample's steps, at first the whole budget, grows by half with a success and shrinks by a tenth
@@ -186,35 +196,27 @@ class RandomSearchAttack:
         queries: windows asked for, a sample; the first is the unattacked one.
     """
 
-    def __init__(self, controller: Callable[..., Any], cost: Any, budget: Budget, queries: int = 100):
+    def __init__(self, controller: Planner, cost: Any, budget: Budget, queries: int = 100):
         check_count("queries", queries)
-        self.controller, self.cost, self.budget, self.queries = BlackBox(controller), cost, budget, queries
+        super().__init__(budget)
+        self.controller, self.cost, self.queries = BlackBox(controller), cost, queries
 
     @property
     def n_queries(self) -> int:
         """Windows asked for so far, by all calls."""
         return self.controller.n_queries
 
-    def __call__(
-        self,
-        u_ini: Any,
-        y_ini: Any,
-        *,
-        y_ref: Any = None,
-        u_ref: Any = None,
-        generator: torch.Generator | None = None,
-        step: int = 0,
-    ) -> Tensor:
-        """Return p, the shape of y_ini; the call of every attack."""
-        y_ini = as_data("y_ini", y_ini)
-        objective = QueryObjective(self.controller, self.cost, u_ini, y_ini, y_ref, u_ref, step)
+    def _perturb(self, call: AttackCall) -> Tensor:
+        problem = (call.u_ini, call.y_ini, call.y_ref, call.u_ref, call.step)
+        objective = QueryObjective(self.controller, self.cost, *problem)
         p = torch.zeros_like(objective.y_ini)
         least, size = objective.psi(p), torch.ones_like(p[..., :1, :1])
         for _ in range(self.queries - 1):
-            trial = self.budget.project(p + size * self.budget.random(objective.y_ini, generator), objective.y_ini)
+            step = size * self.budget.random(objective.y_ini, call.generator)
+            trial = self.budget.project(p + step, objective.y_ini)
             psi = objective.psi(trial)
             better = improves(psi, least)
             p = torch.where(better[..., None, None], trial, p)
             least = torch.where(better, psi, least)
             size = torch.where(better[..., None, None], size * 1.5, size * 0.9).clamp_max(1.0)
-        return checked(p.to(y_ini.dtype), y_ini, self.budget)
+        return p

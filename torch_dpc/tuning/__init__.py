@@ -13,16 +13,19 @@ unattacked window, over one plan or over several in closed loop. The attacker kn
 A common factor on all four weights changes no plan. It is taken out: the mean of the logarithms of R stays.
 """
 
-from .attacker import Attacker
+from ..data.predictor import Predictor
 from .objective import RobustObjective, Windows
-from .outcome import DataPredictor, MeanError, Predictor, QuadraticCost, RunCost
+from .outcome import MeanError, OutputModel, QuadraticCost, RunCost
 from .scales import WeightScales
 from .search import TuningResult, tune
 
+#: The earlier name of `Predictor` in this room.
+DataPredictor = Predictor
+
 __all__ = [
-    "Attacker",
     "DataPredictor",
     "MeanError",
+    "OutputModel",
     "Predictor",
     "QuadraticCost",
     "RobustObjective",

@@ -11,14 +11,15 @@ import torch
 from torch import Tensor
 
 from ..attacks.budgets import Budget
-from ..attacks.costs import Cost, at_step
+from ..attacks.costs import Cost
+from ..attacks.gradient import LinearizedAttack
 from ..checks import as_data, check_count
+from ..data.predictor import Predictor
 from ..errors import Status
 from ..layer import DPCLayer
 from ..problem.reduction import Reduction
 from ..solve.solver import Solver
-from .attacker import Attacker
-from .outcome import DataPredictor, Predictor, QuadraticCost, RunCost
+from .outcome import OutputModel, QuadraticCost, RunCost
 from .scales import WeightScales, base_weight, with_weights
 
 #: layer -> attack, with the call of every attack.
@@ -81,7 +82,7 @@ class RobustObjective:
         budget: Budget,
         *,
         psi: Any = None,
-        predictor: Predictor | None = None,
+        predictor: OutputModel | None = None,
         cost: RunCost | None = None,
         plans: int = 1,
         replan_every: int | None = None,
@@ -106,7 +107,7 @@ class RobustObjective:
         self.layer, self.budget, self.psi, self.attack = layer, budget, psi, attack
         self.plans, self.replan_every, self.iterations = plans, replan_every, iterations
         self.attacked_weight, self.through = attacked_weight, through
-        self.predictor = DataPredictor(layer.data) if predictor is None else predictor
+        self.predictor = Predictor(layer.data) if predictor is None else predictor
         self.cost = _own_cost(layer) if cost is None else cost
         self.u_ini, self.y_ini = _past(windows)
         rows = (plans - 1) * replan_every + horizon
@@ -150,19 +151,31 @@ class RobustObjective:
         return costs[:B], costs[B:]
 
     def _attacker(self, planner: DPCLayer, weights: dict[str, Tensor]) -> Callable[..., Tensor]:
+        psi = WorstRun(self.cost, self.predictor) if self.psi is None else self.psi
         if self.through == "attack" and torch.is_grad_enabled():
-            return Attacker(planner, self.budget, self._psi, self.iterations, keeps_graph=True)
+            return LinearizedAttack(planner, psi, self.budget, iterations=self.iterations, keeps_graph=True)
         constant = planner
         if any(w.requires_grad for w in weights.values()):
             constant = with_weights(_FactoredOnce, self.layer, {name: w.detach() for name, w in weights.items()})
         if self.attack is not None:
             return self.attack(constant)
-        return Attacker(constant, self.budget, self._psi, self.iterations)
+        return LinearizedAttack(constant, psi, self.budget, iterations=self.iterations)
 
-    def _psi(self, u_ini: Tensor, y_ini: Tensor, y_ref: Tensor, u_ref: Tensor, step: int) -> Cost:
-        """Return what the attacker minimises at one plan."""
-        if self.psi is not None:
-            return at_step(self.psi, step)
+
+@dataclass(frozen=True)
+class WorstRun:
+    """psi = -(what the plan would truly cost): the attacker wants the worst.
+
+    Attributes:
+        cost: of a run.
+        predictor: what inputs truly do from the unattacked window on.
+    """
+
+    cost: RunCost
+    predictor: OutputModel
+
+    def given(self, *, u_ini: Tensor, y_ini: Tensor, y_ref: Tensor, u_ref: Tensor) -> Cost:
+        """Return psi of a plan made from this unattacked window for these references."""
         return lambda plan: -self.cost(plan.u, self.predictor(u_ini, y_ini, plan.u), u_ref, y_ref)
 
 

@@ -7,17 +7,12 @@ from typing import Any
 
 from torch import Tensor
 
-from ..data.predictor import Predictor as SubspacePredictor
-
-#: What inputs do from a window on: (u_ini, y_ini, u) -> y, all `(*batch, steps, n)`.
-Predictor = Callable[[Tensor, Tensor, Tensor], Tensor]
+#: What inputs do from a window on: (u_ini, y_ini, u) -> y, all `(*batch, steps, n)`. A
+#: :class:`torch_dpc.attacks.Predictor` is one. Its data should not be those of the layer: a layer with a large lambda_g
+#: plans with the predictor of its own data, and would be judged by its own model.
+OutputModel = Callable[[Tensor, Tensor, Tensor], Tensor]
 #: What a stretch of a run costs: (u, y, u_ref, y_ref), `(*batch, steps, n)` each, -> `(*batch,)`.
 RunCost = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
-
-
-#: What recorded data predict. They had better not be those of the layer: a layer with a large lambda_g plans with this
-#: very predictor, and would be judged by its own opinion.
-DataPredictor = SubspacePredictor
 
 
 class MeanError:

@@ -29,6 +29,10 @@ class Budget:
         """Return a random perturbation that spends the whole budget."""
         return self.minimize_linear(-standard_normal(y_ini, generator), y_ini)
 
+    def __repr__(self) -> str:
+        fields = ", ".join(f"{name}={_shown(value)}" for name, value in vars(self).items())
+        return f"{type(self).__name__}({fields})"
+
     def excess(self, p: Tensor, y_ini: Tensor) -> Tensor:
         """Return how far p is outside the set, relative to its size, `(*batch,)`; zero or less when admissible."""
         outside = euclidean(p - self.project(p, y_ini))[..., 0, 0]
@@ -63,3 +67,7 @@ def nonnegative(name: str, value: Any) -> Tensor:
     if not bool((tensor >= 0).all()) or not bool(torch.isfinite(tensor).all()):
         raise ValueError(f"`{name}` must be finite and not negative, got {value!r}.")
     return tensor
+
+
+def _shown(value: Any) -> str:
+    return str(value.tolist()) if isinstance(value, Tensor) else repr(value)

@@ -7,10 +7,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .budget_base import Budget, direction, euclidean, nonnegative, ratio
+from .base import Budget, direction, euclidean, nonnegative, ratio
 
 
-class Box(Budget):
+class BoxBudget(Budget):
     """|p_ti| <= radius for every entry: the maximum norm.
 
     Args:
@@ -41,7 +41,7 @@ class Box(Budget):
         return radius * (y_ini.abs().amax(dims, keepdim=True) if dims else y_ini.abs())
 
 
-class Ellipsoid(Budget):
+class EllipsoidBudget(Budget):
     """sum (p_ti / scale_ti)^2 <= 1: the scale is the reach along each axis; an axis with scale 0 cannot be touched.
 
     Args:

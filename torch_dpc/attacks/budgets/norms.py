@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .budget_base import Budget, direction, euclidean, nonnegative, ratio, standard_normal
+from .base import Budget, direction, euclidean, nonnegative, ratio, standard_normal
 
 
 class NormBall(Budget):
@@ -37,7 +37,7 @@ class NormBall(Budget):
         return euclidean(p)
 
 
-class Ball(NormBall):
+class BallBudget(NormBall):
     """|p| <= radius, Euclidean over the whole window.
 
     Args:
@@ -45,7 +45,7 @@ class Ball(NormBall):
         relative: |p| <= radius |y_ini| instead.
 
     Example:
-        >>> Ball(2.0).minimize_linear(torch.tensor([[3.0], [4.0]]), torch.zeros(2, 1))
+        >>> BallBudget(2.0).minimize_linear(torch.tensor([[3.0], [4.0]]), torch.zeros(2, 1))
         tensor([[-1.2000], [-1.6000]])
     """
 
@@ -56,8 +56,8 @@ class Ball(NormBall):
         return p * _shrink(euclidean(p), self._reach(y_ini))
 
 
-class RelativeBall(Ball):
-    """|p| <= rho |y_ini|, the paper's budget: `Ball(rho, relative=True)`."""
+class RelativeBallBudget(BallBudget):
+    """|p| <= rho |y_ini|, the paper's budget: `BallBudget(rho, relative=True)`."""
 
     _name = "rho"
 
@@ -66,7 +66,7 @@ class RelativeBall(Ball):
         self.rho = self.radius
 
 
-class L1Ball(NormBall):
+class L1BallBudget(NormBall):
     """sum |p_ti| <= radius: few large entries cost as much as many small ones.
 
     The linear minimiser puts everything on one entry. The projection sorts the entries (Duchi, Shalev-Shwartz, Singer,
@@ -77,7 +77,7 @@ class L1Ball(NormBall):
         relative: sum |p_ti| <= radius sum |y_ti| instead.
 
     Example:
-        >>> L1Ball(2.0).project(torch.tensor([[3.0], [2.0]]), torch.zeros(2, 1))
+        >>> L1BallBudget(2.0).project(torch.tensor([[3.0], [2.0]]), torch.zeros(2, 1))
         tensor([[1.5000], [0.5000]])
     """
 
@@ -107,7 +107,7 @@ class L1Ball(NormBall):
         return p.abs().sum((-2, -1), keepdim=True)
 
 
-class SparseBall(Ball):
+class SparseBallBudget(BallBudget):
     """|p| <= radius on at most `channels` of the n_y sensors: the attacker holds a few of them, and chooses which.
 
     The set is not convex, a union of balls, one for each choice. Both the linear minimiser and the projection are exact
@@ -119,7 +119,7 @@ class SparseBall(Ball):
         relative: |p| <= radius |y_ini| instead, |y_ini| over all sensors.
 
     Example:
-        >>> SparseBall(1, 2.0).minimize_linear(torch.tensor([[3.0, 4.0]]), torch.zeros(1, 2))
+        >>> SparseBallBudget(1, 2.0).minimize_linear(torch.tensor([[3.0, 4.0]]), torch.zeros(1, 2))
         tensor([[-0., -2.]])
     """
 
@@ -147,21 +147,23 @@ class SparseBall(Ball):
         return p * torch.zeros_like(size).scatter(-1, chosen, 1.0)
 
 
-class PerChannel(Budget):
-    """A budget for each channel on its own: `PerChannel(Ball([0.1, 0.2]))` is |p_i| <= radius_i over the window.
+class PerChannelBudget(Budget):
+    """A budget for each channel on its own.
+
+    `PerChannelBudget(BallBudget([0.1, 0.2]))` is |p_i| <= radius_i over the window.
 
     Args:
-        budget: a `Ball`, `RelativeBall` or `L1Ball`, whose radius may be `(n_y,)`, one a channel. A relative one is
-            relative to the channel's own part of y_ini.
+        budget: a `BallBudget`, `RelativeBallBudget` or `L1BallBudget`, whose radius may be `(n_y,)`, one a channel. A
+            relative one is relative to the channel's own part of y_ini.
 
     Example:
-        >>> budget, y_ini = PerChannel(RelativeBall(0.1)), torch.tensor([[3.0, 0.0], [4.0, 20.0]])
+        >>> budget, y_ini = PerChannelBudget(RelativeBallBudget(0.1)), torch.tensor([[3.0, 0.0], [4.0, 20.0]])
         >>> budget.project(torch.ones(2, 2), y_ini)
         tensor([[0.3536, 1.0000], [0.3536, 1.0000]])
     """
 
     def __init__(self, budget: Budget):
-        if not isinstance(budget, NormBall) or isinstance(budget, SparseBall):
+        if not isinstance(budget, NormBall) or isinstance(budget, SparseBallBudget):
             raise ValueError(f"`budget` must be a Ball, RelativeBall or L1Ball, got {type(budget).__name__}.")
         self.budget = budget
 
