@@ -2,5 +2,6 @@
 
 from .masses import OscillatingMasses
 from .quadrotor import Quadrotor
+from .torch_quadrotor import TorchQuadrotor
 
-__all__ = ["OscillatingMasses", "Quadrotor"]
+__all__ = ["OscillatingMasses", "Quadrotor", "TorchQuadrotor"]
