@@ -1,5 +1,6 @@
-"""Shapes: one matrix or one matrix a sample, with a batch of vectors."""
+"""Shapes: one matrix or one matrix a sample, with a batch of vectors; random numbers for a batch."""
 
+from collections.abc import Sequence
 from typing import Any
 
 import torch
@@ -25,6 +26,31 @@ def outer(y: Tensor, x: Tensor, like: Tensor) -> Tensor:
     if like.ndim == 2:
         return y.reshape(-1, y.shape[-1]).mT @ x.reshape(-1, x.shape[-1])
     return (y[..., :, None] * x[..., None, :]).sum_to_size(like.shape)
+
+
+def standard_normal(
+    like: Tensor, generator: torch.Generator | Sequence[torch.Generator] | None, *, tail: int
+) -> Tensor:
+    """Return standard normal numbers with the shape, dtype and device of a tensor, drawn where the generator is.
+
+    Args:
+        like: `(*batch, *own)`.
+        generator: one for all, or one a sample of the last batch dimension, which then draws what it would draw for its
+            sample alone.
+        tail: the number of dimensions in `own`.
+
+    Raises:
+        ValueError: another number of generators than samples.
+    """
+    if isinstance(generator, Sequence):
+        place = like.ndim - tail - 1
+        if place < 0 or len(generator) != like.shape[place]:
+            came = "no batch" if place < 0 else f"a batch of {like.shape[place]}"
+            raise ValueError(f"`generator` must hold one generator a sample, got {len(generator)} for {came}.")
+        parts = zip(like.unbind(place), generator, strict=True)
+        return torch.stack([standard_normal(part, one, tail=tail) for part, one in parts], dim=place)
+    device = like.device if generator is None else generator.device
+    return torch.randn(like.shape, dtype=like.dtype, device=device, generator=generator).to(like.device)
 
 
 def flatten_batch(

@@ -2,15 +2,15 @@
 
 from __future__ import annotations
 
-from typing import Any
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
-from ..checks import as_data
+from .state_space import StateSpace, discretise
 
 
-class OscillatingMasses:
+class OscillatingMasses(StateSpace):
     """Masses on a line, joined to their neighbours and to two walls by springs; one force on each.
 
     The outputs are the state, the positions then the velocities of the masses [m, m/s], and the inputs are forces [N],
@@ -24,7 +24,7 @@ class OscillatingMasses:
         spring: stiffness of each spring [N/m].
         damping: of each mass [N s/m].
         noise: standard deviation of the noise on each measured output [m, m/s].
-        generator: where that noise comes from.
+        generator: the source of that noise; a list holds one a run.
 
     Example:
         >>> plant = OscillatingMasses()
@@ -42,39 +42,20 @@ class OscillatingMasses:
         spring: float = 1.0,
         damping: float = 0.0,
         noise: float = 0.0,
-        generator: torch.Generator | None = None,
+        generator: torch.Generator | Sequence[torch.Generator] | None = None,
     ):
         if not (masses >= 1 and dt > 0 and mass > 0 and spring > 0 and damping >= 0 and noise >= 0):
             raise ValueError(
                 "`masses`, `dt`, `mass` and `spring` must be positive, `damping` and `noise` not negative, got "
                 f"{masses}, {dt}, {mass}, {spring}, {damping}, {noise}."
             )
-        self.n_u, self.n_y, self.dt = masses, 2 * masses, dt
-        self.noise, self.generator = noise, generator
-        self.A, self.B = _discretise(*_continuous(masses, mass, spring, damping), dt)
-        self._x = torch.zeros(self.n_y, dtype=torch.float64)
+        A, B = discretise(*_continuous(masses, mass, spring, damping), dt)
+        super().__init__(A, B, dt=dt, measurement_noise=noise, generator=generator)
 
-    def reset(self, state: Any = None) -> Tensor:
-        """Set the state, `(n_y,)` [m, m/s], zero by default, and return the first measurement."""
-        x = torch.zeros(self.n_y, dtype=torch.float64) if state is None else as_data("state", state).double()
-        if x.shape != (self.n_y,):
-            raise ValueError(f"`state` must have shape ({self.n_y},), got {tuple(x.shape)}.")
-        self._x = x
-        return self.measure()
-
-    def step(self, u: Any) -> Tensor:
-        """Apply the forces u, `(n_u,)` [N], for one step and return the measurement after it, `(n_y,)`."""
-        u = as_data("u", u).double()
-        if u.shape != (self.n_u,):
-            raise ValueError(f"`u` must have shape ({self.n_u},), got {tuple(u.shape)}.")
-        self._x = self.A @ self._x + self.B @ u
-        return self.measure()
-
-    def measure(self) -> Tensor:
-        """Return the present outputs, `(n_y,)`, with new noise if there is any."""
-        if self.noise == 0:
-            return self._x
-        return self._x + self.noise * torch.randn(self.n_y, dtype=torch.float64, generator=self.generator)
+    @property
+    def noise(self) -> float | Tensor:
+        """Standard deviation of the noise on the measured outputs [m, m/s]."""
+        return self.measurement_noise
 
 
 def _continuous(masses: int, mass: float, spring: float, damping: float) -> tuple[Tensor, Tensor]:
@@ -85,12 +66,3 @@ def _continuous(masses: int, mass: float, spring: float, damping: float) -> tupl
     zero = torch.zeros_like(eye)
     A = torch.cat([torch.cat([zero, eye], 1), torch.cat([-stiffness / mass, -damping / mass * eye], 1)])
     return A, torch.cat([zero, eye / mass])
-
-
-def _discretise(A: Tensor, B: Tensor, dt: float) -> tuple[Tensor, Tensor]:
-    """Return the exact discrete model for an input held over dt (Van Loan 1978)."""
-    n, m = B.shape
-    block = torch.zeros(n + m, n + m, dtype=A.dtype)
-    block[:n, :n], block[:n, n:] = A, B
-    whole = torch.linalg.matrix_exp(block * dt)
-    return whole[:n, :n].clone(), whole[:n, n:].clone()

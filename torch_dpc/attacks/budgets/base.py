@@ -7,6 +7,8 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from .. import batching
+
 
 class Budget:
     """An admissible set of perturbations p: closed, and with every p it holds s p, 0 <= s <= 1.
@@ -25,7 +27,7 @@ class Budget:
         """Return the nearest admissible perturbation, in the Euclidean norm."""
         raise NotImplementedError
 
-    def random(self, y_ini: Tensor, generator: torch.Generator | None = None) -> Tensor:
+    def random(self, y_ini: Tensor, generator: Any = None) -> Tensor:
         """Return a random perturbation that spends the whole budget."""
         return self.minimize_linear(-standard_normal(y_ini, generator), y_ini)
 
@@ -39,10 +41,9 @@ class Budget:
         return outside / euclidean(p)[..., 0, 0].clamp_min(torch.finfo(p.dtype).tiny)
 
 
-def standard_normal(y_ini: Tensor, generator: torch.Generator | None) -> Tensor:
-    """Return standard normal numbers of the shape of a window, drawn where the generator is."""
-    device = y_ini.device if generator is None else generator.device
-    return torch.randn(y_ini.shape, dtype=y_ini.dtype, device=device, generator=generator).to(y_ini.device)
+def standard_normal(y_ini: Tensor, generator: Any) -> Tensor:
+    """Return standard normal numbers of the shape of a window; `generator` may be a list, one a run."""
+    return batching.standard_normal(y_ini, generator, tail=2)
 
 
 def euclidean(p: Tensor) -> Tensor:
