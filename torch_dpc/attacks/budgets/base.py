@@ -7,7 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .. import batching
+from ... import batching
 
 
 class Budget:
