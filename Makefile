@@ -11,7 +11,7 @@ ENV := .venv/.complete
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help reproduce test bench docs lint clean distclean
+.PHONY: help reproduce test bench docs lint sanitize clean distclean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -41,12 +41,24 @@ lint: $(ENV)  ## ruff, mypy and the direction of imports
 	$(PY) -m mypy
 	@.venv/bin/lint-imports --no-logo
 
+# The extension is built once a sanitizer, in build/; the interpreter is not, so the sanitizer's library is preloaded.
+# Python keeps memory until it ends, which is no leak. The thread sanitizer takes the fuzz alone: torch has no build for it.
+SANITIZED = build/sanitize-$(1)/lib*/torch_dpc/solve/_kernels*.so
+sanitize: $(ENV)  ## the kernels under the address, undefined-behaviour and thread sanitizers of gcc (a few minutes)
+	@for kind in address,undefined thread; do \
+	CFLAGS="-O1 -g -Werror -fno-omit-frame-pointer -fno-sanitize-recover=all -fsanitize=$$kind" LDFLAGS=-fsanitize=$$kind \
+	$(PY) setup.py -q build --build-base build/sanitize-$${kind%%,*} || exit 1; done
+	LD_PRELOAD=$$(gcc -print-file-name=libtsan.so) $(PY) tests/solve/fuzz_kernels.py 20000 $(call SANITIZED,thread)
+	export LD_PRELOAD="$$(gcc -print-file-name=libasan.so) $$(gcc -print-file-name=libubsan.so)" ASAN_OPTIONS=detect_leaks=0; \
+	$(PY) tests/solve/fuzz_kernels.py 20000 $(call SANITIZED,address) && root=$$PWD && cd build/sanitize-address/lib* && \
+	PYTHONPATH=$$PWD $$root/$(PY) -m pytest -q -p no:cacheprovider -k "not without" $$root/tests/solve/test_kernels.py
+
 clean:  ## remove what the other targets leave, but keep .venv
 	rm -rf results site build *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
 	find . -name .venv -prune -o -name __pycache__ -type d -exec rm -rf {} +
 
 distclean: clean  ## remove .venv and the compiled kernels too
-	rm -rf .venv torch_dpc/*.so
+	rm -rf .venv torch_dpc/solve/*.so
 
 # The stamp is written last, so an install that failed or was interrupted is taken up again by the next run.
 # An environment without a working pip was cut short before it was of use to anybody: it is begun anew.

@@ -1,12 +1,15 @@
-"""The one thing setup.cfg cannot say: the kernels in C, which torch_dpc works without, slower."""
+"""The one thing that setup.cfg cannot say: the kernels in C. Without a compiler torch_dpc works too, slower."""
+
+from glob import glob
 
 from setuptools import Extension, setup
 
 kernels = Extension(
     "torch_dpc.solve._kernels",
     ["torch_dpc/solve/_kernels.c"],
-    depends=["torch_dpc/solve/_system.h", "torch_dpc/solve/_boxes.h", "torch_dpc/solve/_batch.h"],
-    extra_compile_args=["-O3", "-Wno-psabi"],  # vectors are passed between inlined functions alone
+    depends=glob("torch_dpc/solve/*.h"),
+    # psabi: vectors are passed between inlined functions alone.
+    extra_compile_args=["-O3", "-Wall", "-Wextra", "-Wconversion", "-Wshadow", "-Wno-psabi"],
     optional=True,
 )
 

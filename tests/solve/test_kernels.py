@@ -76,7 +76,7 @@ def test_the_kernel_is_the_iteration_of_torch(n):
 @pytest.mark.parametrize("seed", range(6))
 def test_more_rows_than_unknowns_are_solved_by_either_method(seed, pivots, monkeypatch):
     """Boxes that bite all at once, of which no more than n_x rows are independent: pivoting alone would cycle."""
-    monkeypatch.setattr(kernels, "PIVOTS", pivots)
+    monkeypatch.setattr(kernels, "SETTINGS", kernels.KernelSettings(primal_dual_steps=pivots))
     G, Ct, v0, lower, upper = problem(40, count=50, n_x=6, seed=seed)
     lam, steps, converged = kernels.solve_boxes(*(x.numpy() for x in (G, v0, lower, upper)))
     assert converged.all() and steps.max() < 8 * 40
@@ -228,7 +228,7 @@ def test_arrays_that_do_not_fit_are_named(place, wrong, says):
         np.zeros(2, int),
         np.zeros(2, bool),
     ]
-    settings = (1e-12, 1e-5, 1e-10, 10, 1)
+    settings = (kernels.SETTINGS.compiled, 1)
     kernels._kernels.solve_boxes(*arguments, *settings)
     arguments[place] = wrong
     with pytest.raises(ValueError, match=says.replace("?", r"\?")):
@@ -237,13 +237,13 @@ def test_arrays_that_do_not_fit_are_named(place, wrong, says):
 
 @built
 def test_other_bad_arguments():
-    with pytest.raises(TypeError, match="expected 12 arguments, got 1"):
+    with pytest.raises(TypeError, match="expected 9 arguments, got 1"):
         kernels._kernels.solve_boxes(np.eye(3))
     frozen = np.zeros((2, 3))
     frozen.flags.writeable = False
     with pytest.raises(ValueError, match="read-only"):
         kernels._kernels.solve_active(
-            np.eye(3), np.ones((2, 3), bool), np.ones((2, 3)), frozen, np.ones(2, bool), 1e-5, 1
+            np.eye(3), np.ones((2, 3), bool), np.ones((2, 3)), frozen, np.ones(2, bool), kernels.SETTINGS.compiled, 1
         )
 
 

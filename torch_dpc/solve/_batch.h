@@ -1,9 +1,12 @@
 /* A batch of samples, one after the other or shared by threads.
  *
- * Samples are independent and each is computed by one thread in one order: results do not depend on threads or
- * neighbours.
+ * Samples are independent, and each is computed by one thread in one order: a result depends neither on the number of
+ * threads nor on the other samples.
  */
-#include "_boxes.h"
+#ifndef TORCH_DPC_BATCH_H
+#define TORCH_DPC_BATCH_H
+
+#include "_intervals.h"
 
 #if !defined(_WIN32)
 #define HAS_THREADS 1
@@ -11,99 +14,131 @@
 #include <stdatomic.h>
 #endif
 
-/* Samples that a thread takes at once, and how many a batch needs before a second thread is worth its start. */
-enum { CHUNK = 16, ENOUGH = 96 };
+/* Samples that a thread takes at once, and samples for each thread that make it worth its start. */
+enum { CHUNK = 16, SAMPLES_PER_THREAD = 48 };
 
+/* Numbers for every sample: `stride` after each other, or 0 if all samples share them. `data` is NULL if not given. */
+typedef struct {
+    const double *data;
+    int64_t stride;
+} Numbers;
+
+INLINE const double *of_sample(const Numbers *numbers, int64_t i) {
+    return numbers->data ? numbers->data + i * numbers->stride : NULL;
+}
+
+/* The arguments of every entry point; what one does not take stays empty. */
 typedef struct {
     int64_t count, n;
-    const double *G;
-    int64_t G_stride; /* 0 where all samples share one */
-    const double *v, *lower, *upper; /* v0, rhs or v_bar; lower is lam_bar in `adjoint`, or NULL */
-    int64_t bound_stride;
-    const unsigned char *active;
-    double *out;
-    int64_t *steps;
-    unsigned char *good;
-    double hysteresis, standing_out, touching;
-    int64_t max_steps;
+    Numbers G;
+    const Settings *settings;
+    Numbers v0, lower, upper, price; /* solve_intervals */
+    Numbers rhs;                     /* solve_active */
+    Numbers v_bar, lam_bar;          /* adjoint; lam_bar may be missing, and is then zero */
+    const unsigned char *active;     /* (count, n), of the latter two */
+    double *result;                  /* (count, n): lam, the solution, or the adjoint */
+    int64_t *iterations;             /* (count), or NULL */
+    unsigned char *succeeded;        /* (count) */
 } Batch;
 
-INLINE void boxes_of(const Batch *b, Scratch *s, int64_t i) {
-    const Boxes p = {
-        b->G + i * b->G_stride,     b->v + i * b->n, b->lower + i * b->bound_stride, b->upper + i * b->bound_stride,
-        b->hysteresis,              b->standing_out, b->touching, b->max_steps,
+INLINE void solve_sample(const Batch *b, Workspace *w, int64_t i) {
+    const Intervals p = {
+        .G = of_sample(&b->G, i),
+        .v0 = of_sample(&b->v0, i),
+        .lower = of_sample(&b->lower, i),
+        .upper = of_sample(&b->upper, i),
+        .price = of_sample(&b->price, i),
+        .settings = b->settings,
     };
-    b->good[i] = (unsigned char)solve_one(&p, s, b->steps + i);
-    memcpy(b->out + i * b->n, s->lam, (size_t)b->n * sizeof(double));
+    b->succeeded[i] = (unsigned char)solve_intervals(&p, w, b->iterations + i);
+    memcpy(b->result + i * b->n, w->lam, bytes(b->n));
 }
 
-INLINE void active_of(const Batch *b, Scratch *s, int64_t i, int is_adjoint) {
-    const int64_t n = b->n;
-    const double *G = b->G + i * b->G_stride, *v = b->v + i * n;
-    const double *lam_bar = b->lower ? b->lower + i * n : NULL;
-    double *out = b->out + i * n;
+INLINE int64_t list_active(const Batch *b, Workspace *w, int64_t i) {
     int64_t k = 0;
-    for (int64_t j = 0; j < n; j++)
-        if (b->active[i * n + j]) s->rows[k++] = j;
-    for (int64_t j = 0; j < k; j++) {
-        const int64_t row = s->rows[j];
-        s->rhs[row] = is_adjoint ? (lam_bar ? lam_bar[row] : 0.0) - dot(G + row * n, v, n) : v[row];
-    }
-    if (is_adjoint) memcpy(out, v, (size_t)n * sizeof(double));
-    else memset(out, 0, (size_t)n * sizeof(double));
-    b->good[i] = make_room(s, k) >= 0 && factor(s, G, k, 0, b->standing_out);
-    if (!b->good[i]) return;
-    substitute(s, k);
-    for (int64_t j = 0; j < k; j++) out[s->rows[j]] += s->x[j];
+    for (int64_t j = 0; j < b->n; j++)
+        if (b->active[i * b->n + j]) w->rows[k++] = j;
+    return k;
 }
 
-/* The bodies, and once more for processors with wider vectors; `pick` looks which this one is. */
-typedef void Work(const Batch *, Scratch *, int64_t, int64_t);
-#define BODIES(name, attribute)                                                                                \
-    attribute static void boxes_##name(const Batch *b, Scratch *s, int64_t from, int64_t to) {                 \
-        for (int64_t i = from; i < to; i++) boxes_of(b, s, i);                                                 \
-    }                                                                                                          \
-    attribute static void active_##name(const Batch *b, Scratch *s, int64_t from, int64_t to) {                \
-        for (int64_t i = from; i < to; i++) active_of(b, s, i, 0);                                             \
-    }                                                                                                          \
-    attribute static void adjoint_##name(const Batch *b, Scratch *s, int64_t from, int64_t to) {               \
-        for (int64_t i = from; i < to; i++) active_of(b, s, i, 1);                                             \
+/* result_A += G_AA^-1 rhs_A. */
+INLINE void add_solution(const Batch *b, Workspace *w, int64_t i, int64_t k) {
+    const int solved = solve_rows(w, of_sample(&b->G, i), k, 0, b->settings->least_pivot);
+    b->succeeded[i] = (unsigned char)solved;
+    for (int64_t j = 0; solved && j < k; j++) b->result[i * b->n + w->rows[j]] += w->x[j];
+}
+
+INLINE void solve_active_sample(const Batch *b, Workspace *w, int64_t i) {
+    const double *rhs = of_sample(&b->rhs, i);
+    const int64_t k = list_active(b, w, i);
+    for (int64_t j = 0; j < k; j++) w->rhs[w->rows[j]] = rhs[w->rows[j]];
+    memset(b->result + i * b->n, 0, bytes(b->n));
+    add_solution(b, w, i, k);
+}
+
+INLINE void adjoint_sample(const Batch *b, Workspace *w, int64_t i) {
+    const double *G = of_sample(&b->G, i), *v_bar = of_sample(&b->v_bar, i), *lam_bar = of_sample(&b->lam_bar, i);
+    const int64_t k = list_active(b, w, i);
+    for (int64_t j = 0; j < k; j++) {
+        const int64_t row = w->rows[j];
+        w->rhs[row] = (lam_bar ? lam_bar[row] : 0.0) - dot(G + row * b->n, v_bar, b->n);
     }
-BODIES(any, )
+    memcpy(b->result + i * b->n, v_bar, bytes(b->n));
+    add_solution(b, w, i, k);
+}
+
+/* --- the same code for several instruction sets ------------------------------------------------------------------- */
+
+typedef void Work(const Batch *, Workspace *, int64_t from, int64_t to);
+
+#define FOR_SAMPLES(name, sample, attribute)                                                 \
+    attribute static void name(const Batch *b, Workspace *w, int64_t from, int64_t to) {     \
+        for (int64_t i = from; i < to; i++) sample(b, w, i);                                 \
+    }
+#define ENTRY_POINTS(instructions, attribute)                                  \
+    FOR_SAMPLES(solve_##instructions, solve_sample, attribute)                 \
+    FOR_SAMPLES(solve_active_##instructions, solve_active_sample, attribute)   \
+    FOR_SAMPLES(adjoint_##instructions, adjoint_sample, attribute)
+
+ENTRY_POINTS(any, )
 #if defined(__x86_64__)
-BODIES(avx2, __attribute__((target("avx2,fma"))))
+ENTRY_POINTS(avx2, __attribute__((target("avx2,fma"))))
 #endif
 
-static Work *boxes_work = boxes_any, *active_work = active_any, *adjoint_work = adjoint_any;
-static const char *widest = "any";
+static Work *solve_work = solve_any, *solve_active_work = solve_active_any, *adjoint_work = adjoint_any;
+static const char *instructions = "any";
 
-static void pick(void) {
+static void choose_instructions(void) {
 #if defined(__x86_64__)
     __builtin_cpu_init();
-    if (__builtin_cpu_supports("avx2") && __builtin_cpu_supports("fma"))
-        boxes_work = boxes_avx2, active_work = active_avx2, adjoint_work = adjoint_avx2, widest = "avx2";
+    if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma")) return;
+    solve_work = solve_avx2, solve_active_work = solve_active_avx2, adjoint_work = adjoint_avx2;
+    instructions = "avx2";
 #endif
 }
 
-static void flag(const Batch *b, int64_t from, int64_t to) { /* no memory */
-    memset(b->out + from * b->n, 0, (size_t)((to - from) * b->n) * sizeof(double));
-    memset(b->good + from, 0, (size_t)(to - from));
-    if (b->steps) memset(b->steps + from, 0, (size_t)(to - from) * sizeof(int64_t));
+/* --- threads ------------------------------------------------------------------------------------------------------ */
+
+/* Without memory: zeros, and no sample has succeeded. */
+static void mark_failed(const Batch *b, int64_t from, int64_t to) {
+    memset(b->result + from * b->n, 0, bytes((to - from) * b->n));
+    memset(b->succeeded + from, 0, (size_t)(to - from));
+    if (b->iterations) memset(b->iterations + from, 0, bytes(to - from));
 }
 
 #ifdef HAS_THREADS
-/* A job outlives the call that made it where a helper starts late; such a helper finds no sample left and touches
- * nothing but the job. The caller waits for samples that were taken, never for a thread to start. */
+/* A job is freed by its last user: a helper may start after the call that made the job has returned. Such a helper
+ * finds no sample left, and reads nothing but the job. The caller waits for samples, never for a thread to start. */
 typedef struct {
     Batch batch;
     Work *work;
-    atomic_llong taken, done;
+    atomic_llong taken, done; /* samples */
     atomic_int users;
     pthread_mutex_t lock;
     pthread_cond_t all_done;
 } Job;
 
-static void leave(Job *job) {
+static void release_job(Job *job) {
     if (atomic_fetch_sub(&job->users, 1) > 1) return;
     pthread_mutex_destroy(&job->lock);
     pthread_cond_destroy(&job->all_done);
@@ -112,41 +147,35 @@ static void leave(Job *job) {
 
 static void take_chunks(Job *job) {
     const int64_t count = job->batch.count;
-    Scratch s;
-    int ready = -1;
+    Workspace w;
+    int has_tried = 0, has_memory = 0;
     for (;;) {
         const int64_t from = atomic_fetch_add(&job->taken, CHUNK);
         if (from >= count) break;
         const int64_t to = from + CHUNK < count ? from + CHUNK : count;
-        if (ready < 0) ready = scratch_new(&s, job->batch.n);
-        if (ready) job->work(&job->batch, &s, from, to);
-        else flag(&job->batch, from, to);
+        if (!has_tried) has_memory = new_workspace(&w, job->batch.n), has_tried = 1;
+        if (has_memory) job->work(&job->batch, &w, from, to);
+        else mark_failed(&job->batch, from, to);
         if (atomic_fetch_add(&job->done, to - from) + (to - from) == count) {
             pthread_mutex_lock(&job->lock);
             pthread_cond_signal(&job->all_done);
             pthread_mutex_unlock(&job->lock);
         }
     }
-    if (ready >= 0) scratch_free(&s);
+    if (has_tried) free_workspace(&w);
 }
 
 static void *help(void *job) {
     take_chunks(job);
-    leave(job);
+    release_job(job);
     return NULL;
 }
 
-static int run_in_threads(const Batch *batch, Work *work, int64_t threads) {
-    Job *job = malloc(sizeof *job);
-    if (!job) return 0;
-    job->batch = *batch, job->work = work;
-    atomic_init(&job->taken, 0), atomic_init(&job->done, 0), atomic_init(&job->users, 1);
-    pthread_mutex_init(&job->lock, NULL);
-    pthread_cond_init(&job->all_done, NULL);
+static void start_helpers(Job *job, int64_t helpers) {
     pthread_attr_t detached;
     pthread_attr_init(&detached);
     pthread_attr_setdetachstate(&detached, PTHREAD_CREATE_DETACHED);
-    for (int64_t t = 1; t < threads; t++) {
+    while (helpers-- > 0) {
         pthread_t helper;
         atomic_fetch_add(&job->users, 1);
         if (pthread_create(&helper, &detached, help, job) != 0) {
@@ -155,23 +184,38 @@ static int run_in_threads(const Batch *batch, Work *work, int64_t threads) {
         }
     }
     pthread_attr_destroy(&detached);
+}
+
+/* Return 0 without memory for the job. */
+static int run_in_threads(const Batch *batch, Work *work, int64_t threads) {
+    Job *job = malloc(sizeof *job);
+    if (!job) return 0;
+    job->batch = *batch, job->work = work;
+    atomic_init(&job->taken, 0), atomic_init(&job->done, 0), atomic_init(&job->users, 1);
+    pthread_mutex_init(&job->lock, NULL);
+    pthread_cond_init(&job->all_done, NULL);
+    start_helpers(job, threads - 1);
     take_chunks(job);
     pthread_mutex_lock(&job->lock);
     while (atomic_load(&job->done) < batch->count) pthread_cond_wait(&job->all_done, &job->lock);
     pthread_mutex_unlock(&job->lock);
-    leave(job);
+    release_job(job);
     return 1;
 }
 #endif
 
 static void run(const Batch *batch, Work *work, int64_t threads) {
 #ifdef HAS_THREADS
-    const int64_t useful = batch->count / (ENOUGH / 2);
+    const int64_t useful = batch->count / SAMPLES_PER_THREAD;
     if (threads > useful) threads = useful;
     if (threads > 1 && run_in_threads(batch, work, threads)) return;
+#else
+    (void)threads;
 #endif
-    Scratch s;
-    if (scratch_new(&s, batch->n)) work(batch, &s, 0, batch->count);
-    else flag(batch, 0, batch->count);
-    scratch_free(&s);
+    Workspace w;
+    if (new_workspace(&w, batch->n)) work(batch, &w, 0, batch->count);
+    else mark_failed(batch, 0, batch->count);
+    free_workspace(&w);
 }
+
+#endif

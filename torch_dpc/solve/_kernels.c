@@ -4,71 +4,111 @@
  *     solve_active  s_A = G_AA^-1 rhs_A, zero elsewhere
  *     adjoint       v_bar + s,  s_A = G_AA^-1 (lam_bar - G v_bar)_A
  *
- * kernels.py says what the arguments are and what is done with the samples that are flagged; newton.py and
- * active_set.py hold the same mathematics for other devices. G is symmetric, one for all samples or one each.
+ * G is symmetric, one for all samples or one for each. kernels.py describes the arguments, and what becomes of samples
+ * that did not succeed. newton.py and active_set.py hold the same mathematics for other devices.
  *
- * _system.h: one system; _boxes.h: the solve of one sample; _batch.h: batches and threads; here: the arguments.
+ *     _vector.h     vectors, and products with rows of G
+ *     _system.h     one symmetric system
+ *     _intervals.h  the solve of one sample
+ *     _batch.h      batches and threads
+ *     here          arguments
  */
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
 
 #include "_batch.h"
 
-enum { MOST_BUFFERS = 7 };
+/* --- arguments ---------------------------------------------------------------------------------------------------- */
+
+enum { MAX_BUFFERS = 8 };
 
 typedef struct {
-    Py_buffer views[MOST_BUFFERS];
-    int held;
+    Py_buffer views[MAX_BUFFERS];
+    int count;
 } Buffers;
 
 static void release(Buffers *b) {
-    while (b->held) PyBuffer_Release(&b->views[--b->held]);
+    while (b->count) PyBuffer_Release(&b->views[--b->count]);
 }
 
-/* Take a contiguous array of the kind ('d' float64, 'q' int64, '?' bool); NULL with an exception where it is not one. */
-static Py_buffer *take(Buffers *b, PyObject *object, const char *name, char kind, int writable) {
-    Py_buffer *view = &b->views[b->held];
-    if (PyObject_GetBuffer(object, view, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | (writable ? PyBUF_WRITABLE : 0)) < 0) return NULL;
-    b->held++;
-    const char *format = view->format;
-    const int is_int64 = kind == 'q' && view->itemsize == 8 && (*format == 'q' || *format == 'l');
-    if (format[1] == 0 && (*format == kind || is_int64)) return view;
-    PyErr_Format(PyExc_ValueError, "`%s` must have items of type '%c', got '%s'.", name, kind, view->format);
-    return NULL;
-}
-
-static int refuse(const char *name) {
+static int misfit(const char *name) {
     PyErr_Format(PyExc_ValueError, "`%s` does not fit the other arguments.", name);
     return 0;
 }
 
-/* Whether an array is (count, n). */
-static int fits(const Py_buffer *view, const char *name, int64_t count, int64_t n) {
-    return (view->ndim == 2 && view->shape[0] == count && view->shape[1] == n) || refuse(name);
+/* Take a contiguous array of type 'd' (float64), 'q' (int64) or '?' (bool); NULL with an exception if it is not one. */
+static Py_buffer *take(Buffers *b, PyObject *object, const char *name, char type, int flags) {
+    Py_buffer *view = &b->views[b->count];
+    if (PyObject_GetBuffer(object, view, PyBUF_C_CONTIGUOUS | PyBUF_FORMAT | flags) < 0) return NULL;
+    b->count++;
+    const char *format = view->format ? view->format : "B";
+    const int is_int64 = type == 'q' && view->itemsize == 8 && (*format == 'q' || *format == 'l');
+    if (format[1] == 0 && (*format == type || is_int64)) return view;
+    PyErr_Format(PyExc_ValueError, "`%s` must have items of type '%c', got '%s'.", name, type, format);
+    return NULL;
 }
 
-static int fits_flat(const Py_buffer *view, const char *name, int64_t count) {
-    return (view->ndim == 1 && view->shape[0] == count) || refuse(name);
-}
-
-/* Read count and n off the vectors, and G, `(n, n)` or `(count, n, n)`. */
-static int take_matrix(Buffers *b, PyObject *object, const Py_buffer *vectors, const char *name, Batch *batch) {
-    if (vectors->ndim != 2) return refuse(name);
-    batch->count = vectors->shape[0], batch->n = vectors->shape[1];
-    const Py_buffer *G = take(b, object, "G", 'd', 0);
-    if (!G) return 0;
-    const Py_ssize_t *own = G->shape + (G->ndim == 3);
-    if ((G->ndim != 2 && G->ndim != 3) || own[0] != batch->n || own[1] != batch->n) return refuse("G");
-    if (G->ndim == 3 && G->shape[0] != batch->count) return refuse("G");
-    batch->G = G->buf, batch->G_stride = G->ndim == 3 ? batch->n * batch->n : 0;
+/* Take G, `(n, n)` or `(count, n, n)`, and vectors `(count, n)`, which say what count and n are. */
+static int take_problem(Buffers *b, PyObject *G, PyObject *vectors, const char *name, Batch *batch, Numbers *numbers) {
+    const Py_buffer *v = take(b, vectors, name, 'd', 0);
+    if (!v) return 0;
+    if (v->ndim != 2) return misfit(name);
+    batch->count = v->shape[0], batch->n = v->shape[1];
+    *numbers = (Numbers){v->buf, batch->n};
+    const Py_buffer *matrix = take(b, G, "G", 'd', 0);
+    if (!matrix) return 0;
+    if (matrix->ndim != 2 && matrix->ndim != 3) return misfit("G");
+    const int is_shared = matrix->ndim == 2;
+    const Py_ssize_t *shape = matrix->shape + !is_shared;
+    if (shape[0] != batch->n || shape[1] != batch->n) return misfit("G");
+    if (!is_shared && matrix->shape[0] != batch->count) return misfit("G");
+    batch->G = (Numbers){matrix->buf, is_shared ? 0 : batch->n * batch->n};
     return 1;
 }
 
-static PyObject *run_without_gil(const Batch *batch, Work *work, int64_t threads) {
-    Py_BEGIN_ALLOW_THREADS;
-    run(batch, work, threads);
-    Py_END_ALLOW_THREADS;
-    Py_RETURN_NONE;
+/* Take numbers `(count, n)`, or `(n,)` for all samples if `may_be_shared`. */
+static int take_rows(
+    Buffers *b, PyObject *object, const char *name, const Batch *batch, int may_be_shared, Numbers *numbers) {
+    const Py_buffer *view = take(b, object, name, 'd', 0);
+    if (!view) return 0;
+    const int is_shared = may_be_shared && view->ndim == 1;
+    if (!is_shared && (view->ndim != 2 || view->shape[0] != batch->count)) return misfit(name);
+    if (view->shape[view->ndim - 1] != batch->n) return misfit(name);
+    *numbers = (Numbers){view->buf, is_shared ? 0 : batch->n};
+    return 1;
+}
+
+/* Take an array to write to, `(count, n)`. */
+static int take_result(Buffers *b, PyObject *object, const char *name, Batch *batch) {
+    const Py_buffer *view = take(b, object, name, 'd', PyBUF_WRITABLE);
+    if (!view) return 0;
+    if (view->ndim != 2 || view->shape[0] != batch->count || view->shape[1] != batch->n) return misfit(name);
+    batch->result = view->buf;
+    return 1;
+}
+
+/* Take an array to write to, one item of the type for each sample. */
+static int take_counts(Buffers *b, PyObject *object, const char *name, char type, const Batch *batch, void **counts) {
+    const Py_buffer *view = take(b, object, name, type, PyBUF_WRITABLE);
+    if (!view) return 0;
+    if (view->ndim != 1 || view->shape[0] != batch->count) return misfit(name);
+    *counts = view->buf;
+    return 1;
+}
+
+static int take_succeeded(Buffers *b, PyObject *object, const char *name, Batch *batch) {
+    void *counts;
+    if (!take_counts(b, object, name, '?', batch, &counts)) return 0;
+    batch->succeeded = counts;
+    return 1;
+}
+
+static int take_active(Buffers *b, PyObject *object, Batch *batch) {
+    const Py_buffer *view = take(b, object, "active", '?', 0);
+    if (!view) return 0;
+    if (view->ndim != 2 || view->shape[0] != batch->count || view->shape[1] != batch->n) return misfit("active");
+    batch->active = view->buf;
+    return 1;
 }
 
 static int has_arguments(Py_ssize_t got, Py_ssize_t expected) {
@@ -77,90 +117,123 @@ static int has_arguments(Py_ssize_t got, Py_ssize_t expected) {
     return 0;
 }
 
-static PyObject *solve_boxes(PyObject *self, PyObject *const *args, Py_ssize_t nargs) {
+/* --- settings ----------------------------------------------------------------------------------------------------- */
+
+static const char SETTINGS[] = "torch_dpc.solve._kernels.Settings";
+
+static void free_settings(PyObject *capsule) { free(PyCapsule_GetPointer(capsule, SETTINGS)); }
+
+static PyObject *settings(PyObject *self, PyObject *args, PyObject *keywords) {
     (void)self;
-    Buffers held = {.held = 0};
-    Batch b = {0};
-    PyObject *result = NULL;
-    if (!has_arguments(nargs, 12)) return NULL;
-    const Py_buffer *v0, *lower = NULL, *upper = NULL, *lam = NULL, *steps = NULL, *good = NULL;
-    if (!(v0 = take(&held, args[1], "v0", 'd', 0)) || !take_matrix(&held, args[0], v0, "v0", &b)) goto end;
-    if (!(lower = take(&held, args[2], "lower", 'd', 0)) || !(upper = take(&held, args[3], "upper", 'd', 0))) goto end;
-    if (!(lam = take(&held, args[4], "lam", 'd', 1)) || !(steps = take(&held, args[5], "iterations", 'q', 1))) goto end;
-    if (!(good = take(&held, args[6], "converged", '?', 1))) goto end;
-    if (lower->ndim != upper->ndim) {
-        refuse("upper");
-        goto end;
+    static char *names[] = {"hysteresis", "independence", "touching", "primal_dual_steps", NULL};
+    double hysteresis, independence, touching;
+    long long primal_dual_steps;
+    if (!PyArg_ParseTupleAndKeywords(
+            args, keywords, "$dddL", names, &hysteresis, &independence, &touching, &primal_dual_steps))
+        return NULL;
+    Settings *made = malloc(sizeof *made);
+    if (!made) return PyErr_NoMemory();
+    *made = (Settings){hysteresis, independence * independence, touching, primal_dual_steps};
+    PyObject *capsule = PyCapsule_New(made, SETTINGS, free_settings);
+    if (!capsule) free(made);
+    return capsule;
+}
+
+/* Read the last two arguments of every entry point. */
+static int take_options(PyObject *const *args, Batch *batch, int64_t *threads) {
+    batch->settings = PyCapsule_GetPointer(args[0], SETTINGS);
+    if (!batch->settings) return 0;
+    *threads = PyLong_AsLongLong(args[1]);
+    return !PyErr_Occurred();
+}
+
+/* --- entry points ------------------------------------------------------------------------------------------------- */
+
+/* Run without the interpreter's lock, and release the arrays. `is_ready` is 0 if an exception is set. */
+static PyObject *finish(Buffers *held, int is_ready, const Batch *batch, Work *work, int64_t threads) {
+    if (is_ready) {
+        Py_BEGIN_ALLOW_THREADS;
+        run(batch, work, threads);
+        Py_END_ALLOW_THREADS;
     }
-    if (lower->ndim == 1 ? !fits_flat(lower, "lower", b.n) || !fits_flat(upper, "upper", b.n)
-                         : !fits(lower, "lower", b.count, b.n) || !fits(upper, "upper", b.count, b.n))
-        goto end;
-    if (!fits(lam, "lam", b.count, b.n) || !fits_flat(steps, "iterations", b.count)) goto end;
-    if (!fits_flat(good, "converged", b.count)) goto end;
-    b.v = v0->buf, b.lower = lower->buf, b.upper = upper->buf, b.bound_stride = lower->ndim == 2 ? b.n : 0;
-    b.out = lam->buf, b.steps = steps->buf, b.good = good->buf;
-    b.hysteresis = PyFloat_AsDouble(args[7]), b.standing_out = PyFloat_AsDouble(args[8]);
-    b.touching = PyFloat_AsDouble(args[9]), b.max_steps = PyLong_AsLongLong(args[10]);
-    const int64_t threads = PyLong_AsLongLong(args[11]);
-    if (!PyErr_Occurred()) result = run_without_gil(&b, boxes_work, threads);
-end:
-    release(&held);
-    return result;
+    release(held);
+    if (!is_ready) return NULL;
+    Py_RETURN_NONE;
 }
 
-static PyObject *on_active(PyObject *const *args, Py_ssize_t nargs, int is_adjoint) {
-    Buffers held = {.held = 0};
+static PyObject *solve_boxes(PyObject *self, PyObject *const *args, Py_ssize_t count) {
+    (void)self;
+    Buffers held = {.count = 0};
     Batch b = {0};
-    PyObject *result = NULL;
-    if (!has_arguments(nargs, 7 + is_adjoint)) return NULL;
-    const Py_buffer *active, *right = NULL, *lam_bar = NULL, *out = NULL, *good = NULL;
-    const char *name = is_adjoint ? "v_bar" : "rhs";
-    if (!(right = take(&held, args[2], name, 'd', 0)) || !take_matrix(&held, args[0], right, name, &b)) goto end;
-    if (!(active = take(&held, args[1], "active", '?', 0)) || !fits(active, "active", b.count, b.n)) goto end;
-    if (is_adjoint && args[3] != Py_None) {
-        if (!(lam_bar = take(&held, args[3], "lam_bar", 'd', 0)) || !fits(lam_bar, "lam_bar", b.count, b.n)) goto end;
-        b.lower = lam_bar->buf;
-    }
-    args += is_adjoint;
-    if (!(out = take(&held, args[3], "out", 'd', 1)) || !fits(out, "out", b.count, b.n)) goto end;
-    if (!(good = take(&held, args[4], "trusted", '?', 1)) || !fits_flat(good, "trusted", b.count)) goto end;
-    b.active = active->buf, b.v = right->buf, b.out = out->buf, b.good = good->buf;
-    b.standing_out = PyFloat_AsDouble(args[5]);
-    const int64_t threads = PyLong_AsLongLong(args[6]);
-    if (!PyErr_Occurred()) result = run_without_gil(&b, is_adjoint ? adjoint_work : active_work, threads);
-end:
-    release(&held);
-    return result;
+    int64_t threads = 1;
+    void *iterations = NULL;
+    if (!has_arguments(count, 9)) return NULL;
+    const int is_ready = take_problem(&held, args[0], args[1], "v0", &b, &b.v0) &&
+                         take_rows(&held, args[2], "lower", &b, 1, &b.lower) &&
+                         take_rows(&held, args[3], "upper", &b, 1, &b.upper) &&
+                         (b.lower.stride == b.upper.stride || misfit("upper")) &&
+                         take_result(&held, args[4], "lam", &b) &&
+                         take_counts(&held, args[5], "iterations", 'q', &b, &iterations) &&
+                         take_succeeded(&held, args[6], "converged", &b) && take_options(args + 7, &b, &threads);
+    b.iterations = iterations;
+    return finish(&held, is_ready, &b, solve_work, threads);
 }
 
-static PyObject *solve_active(PyObject *self, PyObject *const *args, Py_ssize_t nargs) {
+static PyObject *solve_active(PyObject *self, PyObject *const *args, Py_ssize_t count) {
     (void)self;
-    return on_active(args, nargs, 0);
+    Buffers held = {.count = 0};
+    Batch b = {0};
+    int64_t threads = 1;
+    if (!has_arguments(count, 7)) return NULL;
+    const int is_ready = take_problem(&held, args[0], args[2], "rhs", &b, &b.rhs) &&
+                         take_active(&held, args[1], &b) && take_result(&held, args[3], "out", &b) &&
+                         take_succeeded(&held, args[4], "trusted", &b) && take_options(args + 5, &b, &threads);
+    return finish(&held, is_ready, &b, solve_active_work, threads);
 }
 
-static PyObject *adjoint(PyObject *self, PyObject *const *args, Py_ssize_t nargs) {
+static PyObject *adjoint(PyObject *self, PyObject *const *args, Py_ssize_t count) {
     (void)self;
-    return on_active(args, nargs, 1);
+    Buffers held = {.count = 0};
+    Batch b = {0};
+    int64_t threads = 1;
+    if (!has_arguments(count, 8)) return NULL;
+    const int is_ready = take_problem(&held, args[0], args[2], "v_bar", &b, &b.v_bar) &&
+                         take_active(&held, args[1], &b) &&
+                         (args[3] == Py_None || take_rows(&held, args[3], "lam_bar", &b, 0, &b.lam_bar)) &&
+                         take_result(&held, args[4], "out", &b) && take_succeeded(&held, args[5], "trusted", &b) &&
+                         take_options(args + 6, &b, &threads);
+    return finish(&held, is_ready, &b, adjoint_work, threads);
 }
+
+/* --- the module --------------------------------------------------------------------------------------------------- */
+
+#define FUNCTION(name) ((PyCFunction)(void (*)(void))(name))
 
 static PyMethodDef methods[] = {
-    {"solve_boxes", (PyCFunction)(void (*)(void))solve_boxes, METH_FASTCALL,
-     "solve_boxes(G, v0, lower, upper, lam, iterations, converged, hysteresis, standing_out, touching, "
-     "max_steps, threads)"},
-    {"solve_active", (PyCFunction)(void (*)(void))solve_active, METH_FASTCALL,
-     "solve_active(G, active, rhs, out, trusted, standing_out, threads)"},
-    {"adjoint", (PyCFunction)(void (*)(void))adjoint, METH_FASTCALL,
-     "adjoint(G, active, v_bar, lam_bar, out, trusted, standing_out, threads)"},
+    {"settings", FUNCTION(settings), METH_VARARGS | METH_KEYWORDS,
+     "settings(*, hysteresis, independence, touching, primal_dual_steps)"},
+    {"solve_boxes", FUNCTION(solve_boxes), METH_FASTCALL,
+     "solve_boxes(G, v0, lower, upper, lam, iterations, converged, settings, threads)"},
+    {"solve_active", FUNCTION(solve_active), METH_FASTCALL,
+     "solve_active(G, active, rhs, out, trusted, settings, threads)"},
+    {"adjoint", FUNCTION(adjoint), METH_FASTCALL,
+     "adjoint(G, active, v_bar, lam_bar, out, trusted, settings, threads)"},
     {NULL, NULL, 0, NULL},
 };
 
 static struct PyModuleDef module = {
-    PyModuleDef_HEAD_INIT, "_kernels", "Small systems on the active rows, one sample after the other.", -1, methods,
-    NULL, NULL, NULL, NULL};
+    .m_base = PyModuleDef_HEAD_INIT,
+    .m_name = "_kernels",
+    .m_doc = "Small systems on the active rows, one sample after the other.",
+    .m_size = -1,
+    .m_methods = methods,
+};
+
+PyMODINIT_FUNC PyInit__kernels(void);
 
 PyMODINIT_FUNC PyInit__kernels(void) {
-    pick();
+    choose_instructions();
     PyObject *made = PyModule_Create(&module);
-    if (made && PyModule_AddStringConstant(made, "instructions", widest) < 0) Py_CLEAR(made);
+    if (made && PyModule_AddStringConstant(made, "instructions", instructions) < 0) Py_CLEAR(made);
     return made;
 }

@@ -1,9 +1,12 @@
-"""The kernels as `_kernels.c` exports them: contiguous arrays in, results into arrays that are given."""
+"""The functions of `_kernels.c`: contiguous arrays in, results into arrays that are given."""
+
+from typing import Any
 
 from numpy import ndarray
 
 instructions: str
 
+def settings(*, hysteresis: float, independence: float, touching: float, primal_dual_steps: int) -> Any: ...
 def solve_boxes(
     G: ndarray,
     v0: ndarray,
@@ -12,15 +15,12 @@ def solve_boxes(
     lam: ndarray,
     iterations: ndarray,
     converged: ndarray,
-    hysteresis: float,
-    standing_out: float,
-    touching: float,
-    pivots: int,
+    settings: Any,
     threads: int,
     /,
 ) -> None: ...
 def solve_active(
-    G: ndarray, active: ndarray, rhs: ndarray, out: ndarray, trusted: ndarray, standing_out: float, threads: int, /
+    G: ndarray, active: ndarray, rhs: ndarray, out: ndarray, trusted: ndarray, settings: Any, threads: int, /
 ) -> None: ...
 def adjoint(
     G: ndarray,
@@ -29,7 +29,7 @@ def adjoint(
     lam_bar: ndarray | None,
     out: ndarray,
     trusted: ndarray,
-    standing_out: float,
+    settings: Any,
     threads: int,
     /,
 ) -> None: ...

@@ -1,0 +1,332 @@
+/* One sample whose sets are intervals, hard or priced: lam with  v = v0 - G lam,  and for every row i
+ *
+ *     lower_i <= v_i <= upper_i where lam_i = 0,      v_i >= upper_i where lam_i = price_i,
+ *     v_i = upper_i where 0 < lam_i < price_i,        and the mirror image of both at the lower bound.
+ *
+ * A hard interval has an infinite price. A row is free, held at a bound, or beyond it with its multiplier at the price
+ * (`Side`). One sweep of coordinate descent on the multipliers gives a first guess, and the primal-dual active set
+ * method takes it from there. If its sets cycle or its rows are dependent, the dual active set method starts afresh.
+ */
+#ifndef TORCH_DPC_INTERVALS_H
+#define TORCH_DPC_INTERVALS_H
+
+#include <float.h>
+#include <math.h>
+
+#include "_system.h"
+
+/* Sweeps of coordinate descent before the first step: one saves 0.7 of 3.5 steps on the masses, a second one none. */
+enum { SWEEPS = 1 };
+/* Where a row is. The sign is that of its multiplier. */
+enum { FREE = 0, HELD = 1, BEYOND = 2 };
+
+typedef struct {
+    double hysteresis;         /* v + lam must pass a bound by this, relative to 1 + |bound|, for its row to be held */
+    double least_pivot;        /* rows of Ct count as independent if every pivot of G_AA / G_ii is above this */
+    double touching;           /* a row that depends on held rows may miss its bound by this, relative to 1 + |bound| */
+    int64_t primal_dual_steps; /* before the dual method takes over */
+} Settings;
+
+/* The problem of one sample; price is NULL if every interval is hard. */
+typedef struct {
+    const double *G, *v0, *lower, *upper, *price;
+    const Settings *settings;
+} Intervals;
+
+INLINE double clip(double x, double lower, double upper) { return x > upper ? upper : x < lower ? lower : x; }
+
+INLINE double slack_at(const Settings *settings, double bound) { return settings->hysteresis * (1.0 + fabs(bound)); }
+
+/* Copy the bounds, and invert the diagonal of G; once for all samples that share them. */
+INLINE void prepare(const Intervals *p, Workspace *w) {
+    for (int64_t i = 0; w->diagonal_source != p->G && i < w->n; i++) {
+        const double diagonal = p->G[i * w->n + i];
+        w->inverse_diagonal[i] = diagonal > DBL_MIN ? 1.0 / diagonal : 0.0;
+    }
+    w->diagonal_source = p->G;
+    if (w->lower_source == p->lower && w->upper_source == p->upper && w->price_source == p->price) return;
+    w->lower_source = p->lower, w->upper_source = p->upper, w->price_source = p->price;
+    for (int64_t i = 0; i < round_up(w->n, WIDTH); i++) {
+        const double lower = i < w->n ? p->lower[i] : -INFINITY, upper = i < w->n ? p->upper[i] : INFINITY;
+        const int is_tight = lower == upper; /* always held */
+        w->lower[i] = lower, w->upper[i] = upper;
+        w->price[i] = p->price && i < w->n ? p->price[i] : INFINITY;
+        w->below[i] = is_tight ? -INFINITY : lower - slack_at(p->settings, lower);
+        w->above[i] = is_tight ? -INFINITY : upper + slack_at(p->settings, upper);
+    }
+}
+
+/* Improve lam by coordinate descent on the dual, 1/2 lam'G lam - v0'lam + (support of the box at lam), |lam| <= price,
+ * and keep v = v0 - G lam. */
+INLINE void coordinate_descent(const Intervals *p, Workspace *w, int sweeps) {
+    const int64_t n = w->n;
+    double *restrict v = w->v, *restrict lam = w->lam;
+    const double *restrict lower = w->lower, *restrict upper = w->upper, *restrict price = w->price;
+    for (int sweep = 0; sweep < sweeps; sweep++) {
+        int moved = 0;
+        for (int64_t i = 0; i < n; i++) {
+            const double v_i = v[i], before = lam[i];
+            if ((before == 0.0) & (v_i >= lower[i]) & (v_i <= upper[i])) continue;
+            const double *restrict row = p->G + i * n;
+            const double free_v = v_i + row[i] * before;
+            const double wanted = (free_v - clip(free_v, lower[i], upper[i])) * w->inverse_diagonal[i];
+            const double step = clip(wanted, -price[i], price[i]) - before;
+            if (step == 0.0) continue;
+            subtract_scaled(v, step, row, n);
+            lam[i] += step;
+            moved = 1;
+        }
+        if (!moved) return;
+    }
+}
+
+/* --- the primal-dual active set method ---------------------------------------------------------------------------- */
+
+/* Classify every row by v + lam, in `side`; return whether that repeats `before`. Hard intervals. */
+INLINE int classify_hard(const Workspace *w, int64_t *side, const int64_t *before) {
+    mask differ = {0};
+    for (int64_t i = 0; i < w->n; i += WIDTH) {
+        const vec pushed = load(w->v + i) + load(w->lam + i);
+        const mask now = (mask)(pushed < load(w->below + i)) - (mask)(pushed > load(w->above + i));
+        mask old;
+        memcpy(&old, before + i, sizeof old);
+        differ |= now ^ old;
+        memcpy(side + i, &now, sizeof now);
+    }
+    return !any(differ);
+}
+
+/* The same for intervals with a price. A multiplier counts as the displacement that it makes alone, G_ii lam_i; a row
+ * at its price stays where it is until rounding cannot explain it. */
+INLINE int classify_priced(const Intervals *p, const Workspace *w, int64_t *side, const int64_t *before) {
+    int differ = 0;
+    for (int64_t i = 0; i < w->n; i++) {
+        const double diagonal = p->G[i * w->n + i], pushed = w->v[i] + diagonal * w->lam[i];
+        const double reach = diagonal * w->price[i], upper = w->upper[i], lower = w->lower[i];
+        const double slack = slack_at(p->settings, w->v[i]);
+        int64_t now = FREE;
+        if (pushed > upper + reach + (before[i] == BEYOND ? -slack : slack)) now = BEYOND;
+        else if (pushed < lower - reach - (before[i] == -BEYOND ? -slack : slack)) now = -BEYOND;
+        else if (pushed > w->above[i]) now = HELD;
+        else if (pushed < w->below[i]) now = -HELD;
+        differ |= now != before[i];
+        side[i] = now;
+    }
+    return !differ;
+}
+
+INLINE int classify(const Intervals *p, const Workspace *w, int64_t *side, const int64_t *before) {
+    return p->price ? classify_priced(p, w, side, before) : classify_hard(w, side, before);
+}
+
+INLINE int is_held(int64_t side) { return side == HELD || side == -HELD; }
+
+/* List the held rows of `new_side`, those of before first and in their old order. Return how many, and in `same` how
+ * many at the front of the list did not change. */
+INLINE int64_t list_held(Workspace *w, int64_t k, int64_t *same) {
+    int64_t kept = 0;
+    *same = k;
+    for (int64_t j = 0; j < k; j++) {
+        if (is_held(w->new_side[w->rows[j]])) w->rows[kept++] = w->rows[j];
+        else if (*same == k) *same = j;
+    }
+    if (*same > kept) *same = kept;
+    for (int64_t i = 0; i < w->n; i++)
+        if (is_held(w->new_side[i]) && !is_held(w->side[i])) w->rows[kept++] = i;
+    return kept;
+}
+
+/* Return v0 less what the rows beyond their bounds take of it, and write their multipliers. */
+INLINE const double *shifted_start(const Intervals *p, Workspace *w) {
+    if (!p->price) return p->v0;
+    int is_shifted = 0;
+    for (int64_t i = 0; i < w->n; i++) {
+        if (w->side[i] != BEYOND && w->side[i] != -BEYOND) continue;
+        if (!is_shifted) memcpy(w->start, p->v0, bytes(w->n));
+        is_shifted = 1;
+        w->lam[i] = w->side[i] > 0 ? w->price[i] : -w->price[i];
+        subtract_scaled(w->start, w->lam[i], p->G + i * w->n, w->n);
+    }
+    return is_shifted ? w->start : p->v0;
+}
+
+/* Solve for lam and v with the k rows listed at their bounds; the first `same` columns of U are known.
+ * Return 0 if the rows are dependent. */
+INLINE int hold_rows(const Intervals *p, Workspace *w, int64_t k, int64_t same) {
+    memset(w->lam, 0, bytes(w->n));
+    const double *start = shifted_start(p, w);
+    for (int64_t j = 0; j < k; j++) {
+        const int64_t i = w->rows[j];
+        w->rhs[i] = start[i] - (w->side[i] > 0 ? w->upper[i] : w->lower[i]);
+    }
+    if (!solve_rows(w, p->G, k, same, p->settings->least_pivot)) return 0;
+    subtract_rows(w->v, start, p->G, w->n, w->rows, w->x, k);
+    for (int64_t j = 0; j < k; j++) w->lam[w->rows[j]] = w->x[j];
+    return 1;
+}
+
+/* The primal-dual active set method (Hintermueller, Ito, Kunisch 2002) from the v and lam of the workspace.
+ * Return 0 if the sets do not repeat within the steps, or rows are dependent. */
+INLINE int primal_dual(const Intervals *p, Workspace *w, int64_t *steps) {
+    int64_t k = 0, same = 0;
+    memset(w->side, 0, bytes(w->n));
+    classify(p, w, w->new_side, w->side);
+    for (int64_t step = 0; step < p->settings->primal_dual_steps; step++) {
+        k = list_held(w, k, &same);
+        int64_t *const before = w->side;
+        w->side = w->new_side, w->new_side = before;
+        if (!hold_rows(p, w, k, same)) return 0;
+        ++*steps;
+        if (classify(p, w, w->new_side, w->side)) return 1;
+    }
+    return 0;
+}
+
+/* --- the dual active set method ----------------------------------------------------------------------------------- */
+
+/* A row that moves its multiplier towards the sign `direction` until v is on `bound`, while held rows stay on theirs. */
+typedef struct {
+    int64_t row, direction, side; /* `side` is where it will be: HELD or -HELD */
+    double bound, missing;        /* how far v is on the wrong side of the bound */
+    double to_end;                /* what its multiplier may move until it reaches an end: zero, or its price */
+    double slope;                 /* v of the row falls by this for each unit */
+    double to_blocking;           /* units until the multiplier of a held row reaches an end */
+    int64_t blocking;             /* the place of that row in the list; -1 if there is none */
+} Entering;
+
+/* What row i, which is not held, has to do; nothing is missing if it is on the right side of its bounds. */
+INLINE Entering entering(const Workspace *w, int64_t i) {
+    const double over = w->v[i] - w->upper[i], under = w->lower[i] - w->v[i], price = w->price[i];
+    const double width = w->lower[i] == w->upper[i] ? 2.0 * price : price; /* of a multiplier's range on one side */
+    if (w->side[i] == BEYOND) return (Entering){i, -1, HELD, w->upper[i], -over, width, 0.0, 0.0, -1};
+    if (w->side[i] == -BEYOND) return (Entering){i, 1, -HELD, w->lower[i], -under, width, 0.0, 0.0, -1};
+    if (over > under) return (Entering){i, 1, HELD, w->upper[i], over, price, 0.0, 0.0, -1};
+    return (Entering){i, -1, -HELD, w->lower[i], under, price, 0.0, 0.0, -1};
+}
+
+/* Return the row with the largest violation in the metric of G, or -1 if there is none. */
+INLINE int64_t most_violated(const Workspace *w, const Settings *settings) {
+    int64_t found = -1;
+    double most = 0.0;
+    for (int64_t i = 0; i < w->n; i++) {
+        if (is_held(w->side[i]) || w->skipped[i]) continue;
+        const Entering e = entering(w, i);
+        const double weighted = e.missing * e.missing * w->inverse_diagonal[i];
+        if (!(e.missing > slack_at(settings, e.bound)) || weighted < most) continue;
+        if (w->inverse_diagonal[i] == 0.0) return i;
+        most = weighted, found = i;
+    }
+    return found;
+}
+
+/* How far the multiplier of a held row can move at a given rate before it reaches an end. */
+INLINE double room_of(const Workspace *w, int64_t i, double rate) {
+    const double sign = (double)w->side[i], lam = w->lam[i];
+    if (rate == 0.0) return INFINITY;
+    if (w->lower[i] == w->upper[i]) return fmax(w->price[i] - copysign(lam, lam * rate), 0.0) / fabs(rate);
+    return fmax(rate * sign < 0.0 ? lam * sign : w->price[i] - lam * sign, 0.0) / fabs(rate);
+}
+
+/* The ratio test along x = G_AA^-1 G_Ai, by which the held multipliers fall. Return 0 if the held rows are dependent. */
+INLINE int ratio_test(const Intervals *p, Workspace *w, int64_t k, int64_t same, Entering *e) {
+    const double *row = p->G + e->row * w->n;
+    for (int64_t j = 0; j < k; j++) w->rhs[w->rows[j]] = row[w->rows[j]];
+    if (!solve_rows(w, p->G, k, same, p->settings->least_pivot)) return 0;
+    e->slope = row[e->row], e->to_blocking = INFINITY, e->blocking = -1;
+    for (int64_t j = 0; j < k; j++) {
+        const int64_t i = w->rows[j];
+        e->slope -= row[i] * w->x[j];
+        const double length = room_of(w, i, -(double)e->direction * w->x[j]);
+        if (length < e->to_blocking) e->to_blocking = length, e->blocking = j;
+    }
+    return 1;
+}
+
+/* Move all multipliers by `length` units of the entering row's. */
+INLINE void advance(Workspace *w, int64_t k, Entering *e, double length) {
+    const double step = length * (double)e->direction;
+    for (int64_t j = 0; j < k; j++) w->lam[w->rows[j]] -= step * w->x[j];
+    w->lam[e->row] += step;
+    e->missing -= length * e->slope;
+    e->to_end -= length;
+}
+
+/* Put a row at the end that its multiplier has reached: zero, or the price on one side. */
+INLINE void put_at_end(Workspace *w, int64_t i) {
+    const int is_at_price = fabs(w->lam[i]) > 0.5 * w->price[i]; /* never at an infinite price */
+    w->side[i] = !is_at_price ? FREE : w->lam[i] > 0.0 ? BEYOND : -BEYOND;
+    w->lam[i] = !is_at_price ? 0.0 : copysign(w->price[i], w->lam[i]);
+}
+
+INLINE int64_t remove_blocking(Workspace *w, int64_t k, const Entering *e) {
+    put_at_end(w, w->rows[e->blocking]);
+    memmove(w->rows + e->blocking, w->rows + e->blocking + 1, (size_t)(k - 1 - e->blocking) * sizeof(int64_t));
+    return k - 1;
+}
+
+/* Move the multiplier of row i until v is on its bound and the row joins the list, or until the multiplier is at an
+ * end. Return the new length of the list, and in `same` how many columns of U fit it; -1 if there is no solution, or
+ * rows are dependent. */
+INLINE int64_t add_row(const Intervals *p, Workspace *w, int64_t i, int64_t k, int64_t *same, int64_t *steps, int64_t most) {
+    const Settings *settings = p->settings;
+    Entering e = entering(w, i);
+    for (int has_moved = 0; ++*steps <= most; has_moved = 1) {
+        if (!ratio_test(p, w, k, *same, &e)) return -1;
+        *same = k;
+        const int is_dependent = !(e.slope > settings->least_pivot * p->G[i * w->n + i]);
+        if (is_dependent && !has_moved && e.missing <= settings->touching * (1.0 + fabs(e.bound))) {
+            w->skipped[i] = 1; /* the held rows keep it at its bound, up to rounding */
+            return k;
+        }
+        if (is_dependent) e.slope = 0.0;
+        const double whole = is_dependent ? INFINITY : e.missing / e.slope;
+        const double length = fmin(whole, fmin(e.to_blocking, e.to_end));
+        if (length == INFINITY) return -1;
+        if (length == whole) {
+            w->rows[k++] = i;
+            w->side[i] = e.side;
+        } else {
+            const int is_blocked = e.to_blocking <= e.to_end;
+            advance(w, k, &e, length);
+            if (is_blocked) {
+                *same = e.blocking;
+                k = remove_blocking(w, k, &e);
+                continue;
+            }
+            put_at_end(w, i);
+        }
+        memset(w->skipped, 0, bytes(w->n));
+        if (!hold_rows(p, w, k, *same)) return -1;
+        return *same = k;
+    }
+    return -1;
+}
+
+/* The dual active set method (Goldfarb, Idnani 1983): slower, and finite. Rows join one by one, every multiplier stays
+ * between its ends, and a row whose multiplier reaches an end leaves. Return 0 if it ends without a solution. */
+INLINE int goldfarb_idnani(const Intervals *p, Workspace *w, int64_t *steps) {
+    const int64_t n = w->n, most = 8 * n + 100;
+    int64_t k = 0, same = 0, i;
+    memcpy(w->v, p->v0, bytes(n));
+    memset(w->lam, 0, bytes(n));
+    memset(w->side, 0, bytes(n));
+    memset(w->skipped, 0, bytes(n));
+    while ((i = most_violated(w, p->settings)) >= 0)
+        if ((k = add_row(p, w, i, k, &same, steps, most)) < 0) return 0;
+    return 1;
+}
+
+/* Leave lam in the workspace; return whether it is the solution. */
+INLINE int solve_intervals(const Intervals *p, Workspace *w, int64_t *steps) {
+    *steps = 0;
+    double total = 0.0;
+    for (int64_t i = 0; i < w->n; i++) total += p->v0[i];
+    memset(w->lam, 0, bytes(w->n));
+    if (!isfinite(total)) return 0;
+    prepare(p, w);
+    memcpy(w->v, p->v0, bytes(w->n));
+    coordinate_descent(p, w, SWEEPS);
+    return primal_dual(p, w, steps) || goldfarb_idnani(p, w, steps);
+}
+
+#endif
