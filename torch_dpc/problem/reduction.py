@@ -5,7 +5,8 @@ In the coordinates a of the row space of the data (:mod:`torch_dpc.problem.rows`
 1. The equalities Eq a = e, Up g = u_ini above all, are eliminated:  a = Eq^+ e + Z x,  Z a basis of the kernel of Eq.
 2. The cost is one weighted least squares  min 1/2 |E x - f|^2,  with the rows
    sqrt(R) Uf,  sqrt(Q) Yf,  sqrt(2 lambda_g) M,  sqrt(2 lambda_s) Yp,  and f linear in theta = (u_ini, y_ini, u_ref,
-   y_ref).  A QR of E gives the triangle T; E'E is never formed, for it squares a condition of 1e5.
+   y_ref).  A QR of E gives the triangle T (:mod:`torch_dpc.problem.factorization`); E'E is never formed, for it
+   squares a condition of 1e5.
 
 The constrained rows v = (u, y) = C a are then, in terms of their multipliers lam alone,
 
@@ -13,8 +14,8 @@ The constrained rows v = (u, y) = C a are then, in terms of their multipliers la
 
 and a = A_theta theta - A_lam lam gives everything else back.
 
-Where E is rank-deficient the optimum is a set; the element of minimum norm |g| is selected by charging the kernel
-of E with `TIE_BREAK`, and `Reduction.is_selection` says so.
+Where E is rank-deficient the optimum is a set; the element of minimum norm |g| is selected by a small charge on the
+kernel of E, and `Reduction.is_selection` says so.
 """
 
 from __future__ import annotations
@@ -27,17 +28,10 @@ import torch
 from torch import Tensor
 
 from ..autodiff import carries_derivative, constant, untransformed
+from .factorization import ROUNDING, factor_cost
 from .rows import DataRows
 from .saddle import Saddle, known_solution
 from .weights import Weights, psd_root
-
-#: Singular values of E at or below this fraction of the largest make the optimum a set.
-COST_RANK_TOLERANCE = 1e-14
-#: A row of C whose part in the kernel of the equalities is at most this fraction of it is decided by them.
-DECIDED = 1e-12
-#: Weight on the kernel of E, relative to the largest singular value of E. Its square, 1e-12, is how far from the
-#: optimum (in relative cost curvature) the selected solution may be.
-TIE_BREAK = 1e-6
 
 
 @dataclass(frozen=True, eq=False)
@@ -49,9 +43,10 @@ class Reduction:
         G: effect of the multipliers, `(..., N, N)`, symmetric positive semidefinite.
         Ct: its factor, `(..., N, n_x)`.
         A_theta, A_lam: a = A_theta theta - A_lam lam, `(..., r, n_theta)` and `(..., r, N)`.
+        T, Z: the triangle of the cost and a basis of the kernel of Eq, a = Eq^+ e + Z x, `(..., r, n_x)`.
+        kernel: how the directions in which the cost is flat move v, `(..., N, n_k)`.
         rows: the data rows behind them.
         weights: the weights behind them.
-        is_selection: the cost has a kernel, and the minimum-norm g was selected.
     """
 
     V: Tensor
@@ -59,9 +54,21 @@ class Reduction:
     Ct: Tensor
     A_theta: Tensor
     A_lam: Tensor
+    T: Tensor
+    Z: Tensor
+    kernel: Tensor
     rows: DataRows
     weights: Weights
-    is_selection: bool
+
+    @property
+    def is_selection(self) -> bool:
+        """Whether the cost has a kernel, so that the minimum-norm g was selected."""
+        return self.kernel.shape[-1] > 0
+
+    @property
+    def scale(self) -> Tensor:
+        """The unit of each row of v, `(..., N)`: what is small for a row is small relative to it."""
+        return self.rows.scale
 
     def detach(self) -> Reduction:
         """Return the same numbers without their graph.
@@ -110,11 +117,14 @@ def reduce(rows: DataRows, weights: Weights) -> Reduction:
     Values come from the QR of E. Where the data or the weights carry a graph, V, G, A_theta and A_lam carry it on, by
     the derivative of the saddle-point system they solve (:mod:`torch_dpc.problem.saddle`).
     """
-    V, G, Ct, A_theta, A_lam, T, is_selection = _values(*_constants(rows, weights))
-    if carries_derivative((rows.C, rows.Yp, *weights.tensors.values())):
-        A_theta, A_lam = _with_graph(rows, weights, T, A_theta, A_lam)
-        V, G = rows.C @ A_theta, rows.C @ A_lam
-    return Reduction(V, G, Ct, A_theta, A_lam, rows, weights, is_selection)
+    constants = _constants(rows, weights)
+    with untransformed():  # LAPACK needs plain numbers, which a transform would wrap
+        values = _values(*constants)
+    reduction = replace(values, rows=rows, weights=weights)
+    if not carries_derivative((rows.C, rows.Yp, *weights.tensors.values())):
+        return reduction
+    A_theta, A_lam = _with_graph(reduction)
+    return replace(reduction, V=rows.C @ A_theta, G=rows.C @ A_lam, A_theta=A_theta, A_lam=A_lam)
 
 
 def _constants(rows: DataRows, weights: Weights) -> tuple[DataRows, Weights]:
@@ -126,22 +136,34 @@ def _constants(rows: DataRows, weights: Weights) -> tuple[DataRows, Weights]:
     return rows.map(change), weights.map(change)
 
 
-def _values(rows: DataRows, weights: Weights) -> tuple[Any, ...]:
-    """Return V, G, Ct, A_theta, A_lam, T and whether the kernel of E had to be charged."""
+def _values(rows: DataRows, weights: Weights) -> Reduction:
+    """Return the reduced problem of constants."""
     E, f = _least_squares(rows, weights)
-    T, Qe, is_selection = _factor(E)
-    CZ = rows.C @ rows.Z
-    # A row that the equalities decide is zero here; its rounding would stand for a motion that does not exist.
-    decided = CZ.norm(dim=-1) <= DECIDED * rows.C.norm(dim=-1)
-    CZ = torch.where(decided[..., None], 0.0, CZ)
+    factor = factor_cost(E)
+    T, batch = factor.T, E.shape[:-2]
+    Z = rows.Z.expand(*batch, *rows.Z.shape[-2:])
+    Z = Z.gather(-1, factor.order[..., None, :].expand_as(Z))
+    CZ = _without_rounding(rows.C @ Z, rows.C)
     Ct = torch.linalg.solve_triangular(T, CZ, upper=True, left=False)
-    X_theta = torch.linalg.solve_triangular(T, Qe.mT @ f, upper=True)
+    X_theta = torch.linalg.solve_triangular(T, factor.Q.mT @ f, upper=True)
     # One step of refinement: it matters where weights of zero leave E a condition of 1e10.
-    X_theta = X_theta + torch.linalg.solve_triangular(T, Qe.mT @ (f - E @ X_theta), upper=True)
-    A_theta = rows.Z @ X_theta
+    permuted = E.gather(-1, factor.order[..., None, :].expand_as(E))
+    X_theta = X_theta + torch.linalg.solve_triangular(T, factor.Q.mT @ (f - permuted @ X_theta), upper=True)
+    A_theta = Z @ X_theta
     A_theta[..., :, rows.Eq_theta] += rows.Eq_pinv
-    A_lam = rows.Z @ torch.linalg.solve_triangular(T, Ct.mT, upper=True)
-    return rows.C @ A_theta, Ct @ Ct.mT, Ct, A_theta, A_lam, T, is_selection
+    A_lam = Z @ torch.linalg.solve_triangular(T, Ct.mT, upper=True)
+    kernel = CZ @ factor.kernel
+    return Reduction(rows.C @ A_theta, Ct @ Ct.mT, Ct, A_theta, A_lam, T, Z, kernel, rows, weights)
+
+
+def _without_rounding(product: Tensor, rows: Tensor) -> Tensor:
+    """Return the rows times a matrix of orthonormal columns, zero where only rounding is left.
+
+    A row of the problem that the equalities decide is such a row: its rounding would stand for a motion that does not
+    exist.
+    """
+    norm = torch.linalg.vector_norm
+    return torch.where((norm(product, dim=-1) <= ROUNDING * norm(rows, dim=-1))[..., None], 0.0, product)
 
 
 def _least_squares(rows: DataRows, weights: Weights) -> tuple[Tensor, Tensor]:
@@ -159,33 +181,13 @@ def _least_squares(rows: DataRows, weights: Weights) -> tuple[Tensor, Tensor]:
     batch = torch.broadcast_shapes(*(block.shape[:-2] for block, _, _ in blocks))
     E, f = [], []
     for block, matrix, start in blocks:
-        E.append((block @ rows.Z).expand(*batch, -1, -1))
+        E.append(_without_rounding(block @ rows.Z, block).expand(*batch, -1, -1))
         target = block.new_zeros(*batch, block.shape[-2], rows.n_theta)
         if matrix is not None and start is not None:
             target[..., start : start + matrix.shape[-1]] = matrix
         target[..., rows.Eq_theta] -= block @ rows.Eq_pinv
         f.append(target)
     return torch.cat(E, dim=-2), torch.cat(f, dim=-2)
-
-
-def _factor(E: Tensor) -> tuple[Tensor, Tensor, bool]:
-    """Return T, the orthogonal factor cut to the rows of E, and whether the kernel of E had to be charged."""
-    k = E.shape[-2]
-    Qe, T = torch.linalg.qr(E)
-    if E.shape[-2] >= E.shape[-1]:
-        # A first cheap look at the diagonal: only a suspicious one pays for the singular values.
-        diagonal = T.diagonal(dim1=-2, dim2=-1).abs()
-        if bool((diagonal.amin(-1) > 1e4 * COST_RANK_TOLERANCE * diagonal.amax(-1)).all()):
-            return T, Qe, False
-    _, singular, right_h = torch.linalg.svd(E, full_matrices=True)
-    largest = singular.amax(-1, keepdim=True)
-    padded = torch.nn.functional.pad(singular, (0, E.shape[-1] - singular.shape[-1]))
-    in_kernel = padded <= COST_RANK_TOLERANCE * largest
-    if not bool(in_kernel.any()):
-        return T, Qe, False
-    charge = torch.where(in_kernel, TIE_BREAK * largest, 0.0)
-    Qe, T = torch.linalg.qr(torch.cat([E, charge[..., None] * right_h], dim=-2))
-    return T, Qe[..., :k, :], True
 
 
 def _charged(rows: DataRows) -> Tensor:
@@ -195,8 +197,9 @@ def _charged(rows: DataRows) -> Tensor:
     return torch.diag_embed(rows.charged)
 
 
-def _with_graph(rows: DataRows, weights: Weights, T: Tensor, A_theta: Tensor, A_lam: Tensor) -> tuple[Tensor, Tensor]:
+def _with_graph(reduction: Reduction) -> tuple[Tensor, Tensor]:
     """Attach the derivative of [Psi Eq'; Eq 0] [a; mu] = [Phi theta - C' lam; e] to its known solution."""
+    rows, weights = reduction.rows, reduction.weights
     # Psi = sum of rows' weight rows, and Phi likewise towards what each term is to meet.
     terms: list[tuple[Tensor, Tensor, int | None]] = []
     for term in rows.tracking:
@@ -217,8 +220,8 @@ def _with_graph(rows: DataRows, weights: Weights, T: Tensor, A_theta: Tensor, A_
     n_eq = rows.Eq.shape[-2]
     bottom = top.new_zeros(n_eq, top.shape[-1])
     bottom[torch.arange(n_eq), rows.Eq_theta] = 1.0
-    solution = torch.cat([A_theta, -A_lam], dim=-1)
-    saddle = Saddle(T=T, Z=rows.Z, Eq_pinv=rows.Eq_pinv)
+    solution = torch.cat([reduction.A_theta, -reduction.A_lam], dim=-1)
+    saddle = Saddle(T=reduction.T, Z=reduction.Z, Eq_pinv=rows.Eq_pinv)
     solution = known_solution(Psi, rows.Eq, top, bottom, solution.expand(*batch, -1, -1), saddle)
     return solution[..., : rows.n_theta], -solution[..., rows.n_theta :]
 
@@ -230,8 +233,9 @@ def _gram_of_charged(rows: DataRows) -> Tensor:
     W = torch.cat([rows.Up, rows.Yp, rows.Uf], dim=-2)
     if not carries_derivative((W,)) or rows.is_identity:
         return M
+    W = W / rows.theta_scale[..., : W.shape[-2], None]  # M is the same in any units
     with torch.no_grad():
-        W_pinv = torch.linalg.pinv(W, rtol=1e-10)
+        W_pinv = torch.linalg.pinv(W, rtol=rows.tolerance)
     # M dW = 0 at the point itself, so the term below is 0 in value and -(W^+ dW M + M dW' W^+') in derivative.
     change = W_pinv @ (W - W.detach()) @ M
     return M - change - change.mT

@@ -24,10 +24,8 @@ from ..data.hankel import HankelData
 from .data_derivative import in_row_space
 from .terms import Terms
 
-#: How far u_ini may be from what the data can produce, relative to its norm.
+#: How far u_ini may be from what the data can produce, relative to its norm, each channel in its own unit.
 REACHABLE = 1e-8
-#: Singular values of the equality rows at or below this fraction of the largest count as zero.
-EQUALITY_RANK = 1e-10
 
 
 @dataclass(frozen=True)
@@ -74,8 +72,11 @@ class DataRows:
         Eq_range: orthonormal basis of the range of Eq, or None where it is everything.
         charged: which entries of a lambda_g charges, `(r,)` of ones and zeros: all, or those that W does not reach.
         is_identity: whether that is all by choice.
+        scale, theta_scale: the units of the entries of v, `(N,)`, and of theta, `(n_theta,)`: powers of two near the
+            root mean square of each entry's channel in the recording.
         tracking, fits: the terms of the cost.
         n_theta: entries of theta.
+        tolerance: the data's own rank tolerance.
     """
 
     Up: Tensor
@@ -89,16 +90,19 @@ class DataRows:
     Z: Tensor
     Eq_range: Tensor | None
     charged: Tensor
+    scale: Tensor
+    theta_scale: Tensor
     is_identity: bool
     tracking: tuple[Tracking, ...]
     fits: tuple[Fit, ...]
     n_theta: int
+    tolerance: float
 
     def unreachable(self, theta: Tensor) -> Tensor:
         """Return which samples `(B,)` ask for a u_ini, or a terminal output, that no combination of the data makes."""
         if self.Eq_range is None:
             return torch.zeros(theta.shape[:-1], dtype=torch.bool, device=theta.device)
-        wanted = theta[..., self.Eq_theta]
+        wanted = (theta / self.theta_scale)[..., self.Eq_theta]
         missed = wanted - times(self.Eq_range, times(self.Eq_range.mT, wanted))
         norm = torch.linalg.vector_norm
         return norm(missed, dim=-1) > REACHABLE * norm(wanted, dim=-1)
@@ -106,7 +110,7 @@ class DataRows:
     def map(self, change: Callable[[Tensor, int], Tensor]) -> DataRows:
         """Return the rows with `change(tensor, own dimensions)` in place of each tensor that depends on the data."""
         there = {name: x for name in _OF_DATA if (x := getattr(self, name)) is not None}
-        changed: dict[str, Any] = {name: change(x, 1 if name == "charged" else 2) for name, x in there.items()}
+        changed: dict[str, Any] = {name: change(x, 1 if name in _VECTORS else 2) for name, x in there.items()}
         fits = tuple(replace(fit, rows=change(fit.rows, 2)) for fit in self.fits)
         return replace(self, **changed, fits=fits)
 
@@ -132,7 +136,7 @@ class DataRows:
         fits = tuple(
             replace(fit, rows=torch.stack([rows.fits[i].rows for rows in padded])) for i, fit in enumerate(first.fits)
         )
-        return replace(first, **changed, fits=fits)
+        return replace(first, **changed, fits=fits, tolerance=max(rows.tolerance for rows in many))
 
     @staticmethod
     def of(data: HankelData, device: torch.device, terms: Terms = Terms()) -> DataRows:  # noqa: B008
@@ -170,19 +174,26 @@ class DataRows:
             equal.append(Yf[-last:])
             places.append(torch.arange(n_theta - last, n_theta))
         Eq = torch.cat(equal) if equal else Up[:0]
-        Eq_theta = torch.cat(places) if places else torch.arange(0)
+        Eq_theta = (torch.cat(places) if places else torch.arange(0)).to(device)
+        theta_scale = space.units.to(device)
+        scale = torch.cat([theta_scale[u_ref:], *[theta_scale[u_ref:y_ref]] * terms.rates])
+        eliminated = _eliminate(Eq.detach(), theta_scale[Eq_theta], data.rank_tolerance)
         return DataRows(
-            *(Up, Yp, Uf, Yf, torch.cat(parts), Eq, Eq_theta.to(device), *_eliminate(Eq.detach())),
+            *(Up, Yp, Uf, Yf, torch.cat(parts), Eq, Eq_theta, *eliminated),
             charged=(torch.arange(space.rank, device=device) >= (0 if terms.identity else space.rank_W)).double(),
+            scale=scale,
+            theta_scale=theta_scale,
             is_identity=terms.identity,
             tracking=tuple(tracking),
             fits=tuple(fits),
             n_theta=n_theta,
+            tolerance=data.rank_tolerance,
         )
 
 
-#: The fields that depend on the data.
-_OF_DATA = ("Up", "Yp", "Uf", "Yf", "C", "Eq", "Eq_pinv", "Z", "Eq_range", "charged")
+#: The fields that depend on the data, and those of them that are vectors.
+_OF_DATA = ("Up", "Yp", "Uf", "Yf", "C", "Eq", "Eq_pinv", "Z", "Eq_range", "charged", "scale", "theta_scale")
+_VECTORS = ("charged", "scale", "theta_scale")
 
 
 def _padded(rows: DataRows, more: int) -> DataRows:
@@ -199,13 +210,17 @@ def _padded(rows: DataRows, more: int) -> DataRows:
     )
 
 
-def _eliminate(Eq: Tensor) -> tuple[Tensor, Tensor, Tensor | None]:
-    """Return Eq^+, a basis of the kernel of Eq, and one of its range where that is not everything."""
+def _eliminate(Eq: Tensor, units: Tensor, tolerance: float) -> tuple[Tensor, Tensor, Tensor | None]:
+    """Return Eq^+, a basis of the kernel of Eq, and one of the range of Eq in its units where that is not everything.
+
+    The pseudo-inverse is that of the rows in their own units: a row that is small in the caller's units counts as much
+    as any other.
+    """
     if len(Eq) == 0:
         return Eq.mT, torch.eye(Eq.shape[1], dtype=Eq.dtype, device=Eq.device), None
     with torch.no_grad():
-        left, singular, right_h = torch.linalg.svd(Eq, full_matrices=True)
-        rank = int((singular > EQUALITY_RANK * singular[0].clamp_min(torch.finfo(torch.float64).tiny)).sum())
-        pinv = (right_h[:rank].T / singular[:rank]) @ left[:, :rank].T
+        left, singular, right_h = torch.linalg.svd(Eq / units[:, None], full_matrices=True)
+        rank = int((singular > tolerance * singular.amax()).sum()) if singular.numel() else 0
+        pinv = (right_h[:rank].T / singular[:rank]) @ left[:, :rank].T / units
         reached = None if rank == len(Eq) else left[:, :rank].contiguous()
         return pinv, right_h[rank:].T.contiguous(), reached

@@ -14,6 +14,8 @@ from ..autodiff import is_mapped
 ASYMMETRY = 1e-6
 #: An eigenvalue of Q or R below minus this fraction of the largest makes the matrix indefinite.
 NEGATIVE_EIGENVALUE = 1e-9
+#: An eigenvalue of a weight with unit diagonal at or below this, times its size, is rounding.
+EIGENVALUE_ROUNDING = 1e-15
 
 
 @dataclass(frozen=True, eq=False)
@@ -80,14 +82,26 @@ def weight_matrix(name: str, value: Any, channels: int, horizon: int) -> Tensor:
         asymmetry = (matrix - transposed).abs().amax()
         if asymmetry > ASYMMETRY * largest:
             raise ValueError(f"`{name}` must be symmetric, got entries that differ by {float(asymmetry):.1e}.")
-        smallest = torch.linalg.eigvalsh((matrix + transposed) / 2).amin()
-        if smallest < -NEGATIVE_EIGENVALUE * largest:
-            raise ValueError(f"`{name}` must be positive semidefinite, got an eigenvalue of {float(smallest):.1e}.")
+        smallest = _smallest_eigenvalue((matrix + transposed) / 2)
+        if smallest < -NEGATIVE_EIGENVALUE:
+            raise ValueError(
+                f"`{name}` must be positive semidefinite, got an eigenvalue of {float(smallest):.1e} (channels brought "
+                f"to a unit diagonal)."
+            )
     matrix = (matrix + transposed) / 2
     if matrix.shape[-1] == size:
         return matrix
     steps = torch.eye(horizon, dtype=matrix.dtype, device=matrix.device)
     return torch.einsum("st,...ij->...sitj", steps, matrix).reshape(*matrix.shape[:-2], size, size)
+
+
+def _smallest_eigenvalue(matrix: Tensor) -> Tensor:
+    """Return the smallest eigenvalue of a symmetric matrix of any batch, brought to a unit diagonal."""
+    diagonal = matrix.diagonal(dim1=-2, dim2=-1)
+    # A zero on the diagonal of a semidefinite matrix has a zero row: one that is not stays, and shows.
+    size = torch.where(diagonal == 0, matrix.abs().amax(-1), diagonal.abs()).sqrt()
+    inverse = torch.where(size > 0, 1 / size, 0.0)
+    return torch.linalg.eigvalsh(matrix * inverse[..., :, None] * inverse[..., None, :]).amin()
 
 
 def penalty(name: str, value: Any) -> Tensor:
@@ -129,6 +143,14 @@ def as_weight(name: str, value: Any) -> Tensor:
 
 
 def psd_root(matrix: Tensor) -> Tensor:
-    """Return S with S'S = matrix, for a symmetric positive semidefinite matrix `(..., n, n)`."""
-    values, vectors = torch.linalg.eigh(matrix)
-    return values.clamp_min(0.0).sqrt()[..., None] * vectors.mT
+    """Return S with S'S = matrix, for a symmetric positive semidefinite matrix `(..., n, n)`.
+
+    The matrix is brought to a unit diagonal first, so that S is accurate column by column whatever the units of the
+    channels, and an eigenvalue at rounding level is zero: a weight that is not there must not charge anything.
+    """
+    diagonal = matrix.diagonal(dim1=-2, dim2=-1).clamp_min(0.0).sqrt()
+    inverse = torch.where(diagonal > 0, 1 / diagonal, 0.0)
+    values, vectors = torch.linalg.eigh(matrix * inverse[..., :, None] * inverse[..., None, :])
+    rounding = EIGENVALUE_ROUNDING * matrix.shape[-1] * values.amax(-1, keepdim=True)
+    roots = torch.where(values > rounding, values, 0.0).sqrt()
+    return roots[..., None] * vectors.mT * diagonal[..., None, :]
