@@ -1,10 +1,11 @@
 # `make` lists the targets. The first one used builds the environment, .venv; nothing is needed before it but
-# Python 3.11, make and a C compiler. Pip's own settings (PIP_INDEX_URL, PIP_FIND_LINKS, ...) say where packages come
-# from, and so whether torch is its CPU or its CUDA build.
+# Python 3.11 to 3.14, make and a C compiler. Pip's own settings (PIP_INDEX_URL, PIP_FIND_LINKS, ...) say where packages
+# come from, and so whether torch is its CPU or its CUDA build.
 
 # Deferred: looked up only when the environment is made. Override with `make PYTHON=...`.
-PYTHON ?= $(shell for p in python3.11 python3; do \
-	$$p -c 'import sys; sys.exit(sys.version_info[:2] != (3, 11))' 2>/dev/null && echo $$p && break; done)
+# Python 3.11 first: PyBullet, the quadrotor's simulator, has no wheels for later versions.
+PYTHON ?= $(shell for p in python3.11 python3.12 python3.13 python3.14 python3; do \
+	$$p -c 'import sys; sys.exit(not (3, 11) <= sys.version_info[:2] <= (3, 14))' 2>/dev/null && echo $$p && break; done)
 PY  := .venv/bin/python
 PIP := $(PY) -m pip --disable-pip-version-check -qq install -c constraints.txt --no-build-isolation
 ENV := .venv/.complete
@@ -64,14 +65,14 @@ distclean: clean  ## remove .venv and the compiled kernels too
 # An environment without a working pip was cut short before it was of use to anybody: it is begun anew.
 $(ENV): setup.cfg setup.py constraints.txt torch_dpc/solve/_kernels.c $(wildcard torch_dpc/solve/*.h)
 	@$(PY) -m pip --version >/dev/null 2>&1 || { \
-	test -n "$(PYTHON)" || { echo "Python 3.11 was not found: install it, or name one with make PYTHON=..."; exit 1; }; \
+	test -n "$(PYTHON)" || { echo "No Python from 3.11 to 3.14 was found: install one, or name it with make PYTHON=..."; exit 1; }; \
 	echo "Creating .venv with $(PYTHON) (about 2 minutes the first time) ..."; $(PYTHON) -m venv --clear .venv; }
 	@echo "[1/4] PyTorch ..."
 	@$(PIP) setuptools torch
 	@echo "[2/4] torch_dpc, test tools, plotting ..."
 	@$(PIP) -e '.[scripts,dev,save]'
 	@echo "[3/4] quadrotor simulator ..."
-	@$(PIP) -e '.[quadrotor]' || $(call without,the quadrotor)
+	@$(PIP) --only-binary pybullet -e '.[quadrotor]' 2>/dev/null || $(call without,PyBullet and so the quadrotor: it has wheels up to Python 3.11)
 	@echo "[4/4] baselines ..."
 	@$(PIP) -e '.[baselines]' || $(call without,the cvxpylayers and QPLayer baselines)
 # qpth works with numpy 2 but declares numpy<2, and pip would take cvxpy and cvxpylayers back years to please it.
