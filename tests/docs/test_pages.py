@@ -10,7 +10,10 @@ import torch
 ROOT = Path(__file__).resolve().parents[2]
 PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 #: A fenced block of Python, as a listing or as the cell of a notebook; {code-cell} may carry options after its name.
-BLOCK = re.compile(r"^(?P<fence>`{3,}|:{3,})(?:python|\{code-block\} python|\{code-cell\}[^\n]*)\n(?P<code>.*?)^(?P=fence)\s*$", re.M | re.S)
+BLOCK = re.compile(
+    r"^(?P<fence>`{3,}|:{3,})(?:python|\{code-block\} python|\{code-cell\}[^\n]*)\n(?P<code>.*?)^(?P=fence)\s*$",
+    re.M | re.S,
+)
 OPTION = re.compile(r"\A(?:---\n.*?^---\n|(?::[\w-]+:[^\n]*\n)+)", re.M | re.S)
 
 
