@@ -179,8 +179,9 @@ def _key(line: Line) -> tuple[str, ...]:
 
 def _is_done(line: Line | None, stamp: Line) -> bool:
     """A line counts if what it was made with is the same; a full one counts for a quick run too."""
-    same = line is not None and line["status"] not in ("not run", "no problem")
-    same = same and all(line[name] == str(stamp[name]) for name in stamp if name != "mode")
+    if line is None or line["status"] in ("not run", "no problem"):
+        return False
+    same = all(line[name] == str(stamp[name]) for name in stamp if name != "mode")
     return same and line["mode"] in (stamp["mode"], "full")
 
 

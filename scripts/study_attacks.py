@@ -14,13 +14,16 @@ the reference; and in closed loop, with the paper's budget. Leaves, in results/:
 
 from __future__ import annotations
 
+import functools
 import time
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import torch
 
+import torch_dpc as dpc
 from scripts.experiments.case import ATTACK_SEED
 from scripts.experiments.surrogates import closed_loop, load, surrogate
 from scripts.shared.command import arguments, run_all, versions
@@ -32,12 +35,12 @@ WINDOW_EVERY, QUICK_EVERY = 12, 48
 PLANTS = {"masses": "Oscillating masses", "quadrotor": "Quadrotor"}
 STEPS = 20
 FIRST = "Algorithm 1"
-ATTACKS = {
+ATTACKS: dict[str, Callable[..., Any]] = {
     FIRST: attacks.LinearizedAttack,
-    "projected gradient": lambda *problem: attacks.ProjectedGradientAttack(*problem, STEPS),
-    "momentum 0.5": lambda *problem: attacks.ProjectedGradientAttack(*problem, STEPS, momentum=0.5),
-    "5 restarts": lambda *problem: attacks.ProjectedGradientAttack(*problem, STEPS, restarts=5),
-    "Frank-Wolfe": lambda *problem: attacks.FrankWolfeAttack(*problem, STEPS),
+    "projected gradient": functools.partial(attacks.ProjectedGradientAttack, steps=STEPS),
+    "momentum 0.5": functools.partial(attacks.ProjectedGradientAttack, steps=STEPS, momentum=0.5),
+    "5 restarts": functools.partial(attacks.ProjectedGradientAttack, steps=STEPS, restarts=5),
+    "Frank-Wolfe": functools.partial(attacks.FrankWolfeAttack, steps=STEPS),
 }
 #: All relative to y_ini; sizes of one order, so that psi moves by the same order.
 BUDGETS = {
@@ -66,6 +69,7 @@ def run_seed(name: str, seed: int, every: int) -> list[dict[str, Any]]:
     plant = load(name, seed, every)
     layer = surrogate(plant)
     u_ini, y_ini = plant.windows
+    assert isinstance(layer.data, dpc.HankelData)
     tracking = attacks.TrackingError(layer.data, layer.Q)
     costs = {"target input": (plant.cost, plant.cost.at(0))}
     costs["tracking error"] = (tracking, tracking.given(u_ini=u_ini, y_ini=y_ini, y_ref=plant.refs["y_ref"]))
@@ -95,6 +99,7 @@ def run_closed_loop(name: str, seed: int) -> list[dict[str, Any]]:
     plant = load(name, seed, WINDOW_EVERY)
     layer, budget = surrogate(plant), attacks.RelativeBall(plant.rho)
     judged = JUDGED[name].to(torch.float64)
+    assert isinstance(layer.data, dpc.HankelData)
     costs = {"target input": plant.cost, "tracking error": attacks.TrackingError(layer.data, torch.diag(judged))}
     runs: list[tuple[str, str, Any]] = [("-", "no attack", None), ("-", "random noise", attacks.RandomAttack(budget))]
     runs += [(kind, method, ATTACKS[method](layer, cost, budget)) for kind, cost in costs.items() for method in IN_LOOP]

@@ -53,7 +53,7 @@ def run_plant(plant: str, seed: int, rhos: Array) -> list[dict[str, Any]]:
             "failed_at": run["t"][failed(run).argmax()] if failed(run).any() else np.nan,
             "unsolved": run["unsolved"][:: EXPERIMENTS[plant].replan_every].sum(),
         }
-        for run in run_seed(EXPERIMENTS[plant], seed, rhos)
+        for run in run_seed(EXPERIMENTS[plant], seed, rhos.tolist())
     ]
 
 
@@ -62,7 +62,7 @@ def failed(run: dict[str, Any]) -> Array:
     if "crashed" in run:
         return run["crashed"]
     outputs = np.stack([np.abs(run[f"y{i}"]) for i in (1, 2, 3, 4)], axis=1)
-    return (outputs > EXPERIMENTS["masses"].y_max).any(axis=1)
+    return np.any(outputs > EXPERIMENTS["masses"].y_max, axis=1)
 
 
 def of_plant(rows: Rows, plant: str) -> Rows:

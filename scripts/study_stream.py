@@ -15,6 +15,7 @@ results/:
 from __future__ import annotations
 
 import csv
+import functools
 import json
 import multiprocessing
 import resource
@@ -41,7 +42,7 @@ CHUNK = 20_000  # samples that the plant makes at once
 NOISE = 1e-2
 SAMPLES = {"masses": (100_000, 1_000_000, 10_000_000), "quadrotor": (100_000, 1_000_000)}
 QUICK = 100  # --quick makes this share
-WEIGHTS = {"Q": 10.0, "R": 1.0, "lambda_g": Masses.lambda_g, "lambda_s": Masses.lambda_s}
+WEIGHTS: dict[str, Any] = {"Q": 10.0, "R": 1.0, "lambda_g": Masses.lambda_g, "lambda_s": Masses.lambda_s}
 UPDATES = 300
 N_G = (500, 50_000)
 SEED = 0
@@ -118,11 +119,18 @@ def updates(name: str, count: int) -> dict[str, float]:
     (u, y), *_ = recorder(name, 2000 + count)
     held.append(u[:2000], y[:2000])
     layer = dpc.DPCLayer(held.data, **WEIGHTS, u_set=dpc.Box(-1.0, 1.0))
-    update, row_space, reduction = [], [], []
+    update: list[float] = []
+    row_space: list[float] = []
+    reduction: list[float] = []
+
+    def renewed(k: int) -> dpc.HankelData:
+        held.append(u[k], y[k])
+        return held.data
+
     for k in range(2000, 2000 + count):
-        data = _timed(update, lambda k=k: (held.append(u[k], y[k]), held.data)[1])
+        data = _timed(update, functools.partial(renewed, k))
         if k % 10 == 0:
-            _timed(row_space, lambda data=data: data.row_space)
+            _timed(row_space, functools.partial(getattr, data, "row_space"))
             layer.data = data
             _timed(reduction, lambda: layer.reduction)
     out = {"rows": float(sum(len(m) for m in held.data.matrices))}
@@ -144,7 +152,7 @@ def files(name: str, n_g: int) -> dict[str, float]:
             path = Path(folder) / f"{label}.safetensors"
             layer.save(path, data=whole)
             times: list[float] = []
-            back = _timed(times, lambda path=path: dpc.DPCLayer.load(path))
+            back = _timed(times, functools.partial(dpc.DPCLayer.load, path))
             moved = (back(*window).u - layer(*window).u).abs().max()
             out |= {f"{label} [kB]": path.stat().st_size / 1e3, f"{label}, read [ms]": times[0]}
             out[f"{label}, change of u"] = float(moved)
@@ -219,7 +227,8 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--fresh", action="store_true", help="forget what was measured before")
     args = parser.parse_args(argv)
     args.out.mkdir(parents=True, exist_ok=True)
-    path, done = args.out / "stream.csv", {}
+    path = args.out / "stream.csv"
+    done: dict[tuple[str, str], dict[str, float]] = {}
     if path.exists() and not args.fresh:
         with path.open(newline="") as file:
             for part, key, quantity, value in list(csv.reader(file))[1:]:

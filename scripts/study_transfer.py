@@ -74,7 +74,8 @@ def run_seed(name: str, seed: int, every: int) -> list[dict[str, Any]]:
     u_ini, y_ini = plant.windows
     cost = plant.cost.at(0)
     nominal = cost(victim(u_ini, y_ini, **plant.refs))
-    rows, full_p = [], None
+    rows: list[dict[str, Any]] = []
+    full_p = None
     for kind, knows, method, attack in attackers(plant, victim, seed):
         generator = torch.Generator().manual_seed(ATTACK_SEED + seed)
         p = attack(u_ini, y_ini, **plant.refs, generator=generator)
@@ -86,8 +87,8 @@ def run_seed(name: str, seed: int, every: int) -> list[dict[str, Any]]:
         queries = getattr(attack, "n_queries", 0) / len(u_ini)
         in_closed_loop = name == "masses" and (method != MORE_STEPS or knows == FULL)
         error = closed_loop(plant, victim, attack, seed)[0] if in_closed_loop else np.nan
-        row = {"plant": name, "seed": seed, "kind": kind, "knows": knows, "method": method, "queries": queries}
-        row["cosine"] = cosine  # with what Algorithm 1 does with full knowledge, the first of all
+        row: dict[str, Any] = {"plant": name, "seed": seed, "kind": kind, "knows": knows, "method": method}
+        row |= {"queries": queries, "cosine": cosine}  # the cosine with what Algorithm 1 does with full knowledge, the first of all
         row |= {"psi": float(nominal.mean()), "decrease": decrease, "unsolved": int((~solved).sum()), "error": error}
         rows.append(row)
     full = next(row for row in rows if (row["knows"], row["method"]) == (FULL, ONE_STEP))

@@ -148,8 +148,10 @@ def tune_plant(plant: str, out: Path, seeds: int, workers: int, steps: int = STE
     runs = Table(out / f"{stem}.csv", RUN)
 
     found = {(row["case"], row["point"]) for row in points.rows()}
-    jobs = [job for case in cases for job in search_jobs(case.name)]
-    jobs = [(*job, steps) for job in jobs if any((job[0], label(m, job[1])) not in found for m in job[2])]
+    wanted = [job for case in cases for job in search_jobs(case.name)]
+    jobs: list[tuple[Any, ...]] = [
+        (*job, steps) for job in wanted if any((job[0], label(m, job[1])) not in found for m in job[2])
+    ]
     for case, results in tqdm(as_they_finish(search, jobs, workers), total=len(jobs), desc=f"{plant}: search"):
         for result in results:
             name = label(result.method, result.attacked_weight)

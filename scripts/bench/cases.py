@@ -130,6 +130,7 @@ def inputs_of(plant: str, layer: dpc.DPCLayer, u: Tensor, y: Tensor, count: int 
         references = {"y_ref": case.around(angle)}
     else:
         y_ref, u_ref = case.references(1)
+        assert u_ref is not None
         references = {"y_ref": y_ref[0], "u_ref": u_ref[0]}
     inputs = {"u_ini": u_ini, "y_ini": y_ini, **references}
     solved = (layer(**inputs, on_failure="nan").info.status == dpc.Status.SOLVED).nonzero()[:count, 0]
@@ -158,13 +159,14 @@ def write_case(path: Path, plant: str, horizon: int, n_g: int, count: int = MOST
             found.append(reference)
         if len(found) == CHECKED:
             break
-    references = {
+    saved: dict[str, Any] = {f"input_{name}": value.numpy() for name, value in inputs.items()}
+    saved |= {
         "checked": np.array(checked, dtype=int),
         "v": np.array([f.v for f in found]),
         "gradient": np.array([f.gradient for f in found]),
         "error": np.array([f.error for f in found]),
     }
-    np.savez(path, recorded_u=u, recorded_y=y, **{f"input_{k}": v for k, v in inputs.items()}, **references)
+    np.savez(path, recorded_u=u, recorded_y=y, **saved)
 
 
 def read_case(path: Path) -> tuple[tuple[Tensor, Tensor], dict[str, Tensor], dict[str, Array]]:

@@ -67,6 +67,7 @@ class HigherPrecision:
 
     def __init__(self, layer: dpc.DPCLayer):
         self._layer, data = layer, layer.data
+        assert isinstance(data, dpc.HankelData)
         basis = _wide(data.row_space.basis)
         self.Up, self.Yp, self.Uf, self.Yf = (_wide(m) @ basis for m in (data.Up, data.Yp, data.Uf, data.Yf))
         self.C = np.concatenate([self.Uf, self.Yf])

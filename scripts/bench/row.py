@@ -90,7 +90,8 @@ class Solver:
             loss.backward()
         times = [1e3 * (moment - began) for moment in (planned, time.perf_counter())]
         v = torch.cat([sol.u.flatten(-2), sol.y.flatten(-2)], dim=-1).detach().numpy()
-        return v, None if y_ini is None else y_ini.grad.numpy(), getattr(sol.info, "message", ""), times
+        gradient = None if y_ini is None or y_ini.grad is None else y_ini.grad.numpy()
+        return v, gradient, getattr(sol.info, "message", ""), times
 
 
 def measure(row: Row, case: Path, mode: str, threads: int) -> None:
@@ -120,7 +121,8 @@ def _measure(row: Row, case: Path, budget: float, told: Told) -> None:
 
     problems = [take(inputs, i) for i in range(CYCLE)] if row.batch == 1 else [take(inputs, slice(row.batch))]
     problems = [solver.prepare(problem) for problem in problems]
-    call, note, began = solver.forward, "", time.perf_counter()
+    call: Any = solver.forward
+    note, began = "", time.perf_counter()
     try:
         call(problems[0])
         first = time.perf_counter() - began

@@ -13,7 +13,7 @@ from scripts.shared.plots import plt, style
 from scripts.shared.rows import Array
 
 # Okabe and Ito's colours, and a marker of its own for each group.
-GROUPS = {
+GROUPS: dict[str, tuple[str, str, float]] = {
     "torch_dpc": ("*", "#d55e00", 260),
     "peers, our reduced form": ("o", "#0072b2", 55),
     "peers, the QP as the paper prints it": ("s", "#999999", 45),
@@ -28,14 +28,14 @@ def scatter(path: Path, lines: list[dict[str, str]], missing: list[str]) -> None
     """Draw the lines, which have a time and a gradient error, and name the configurations that have none."""
     style()
     figure, axes = plt.subplots(figsize=(9.6, 6.4))
-    points = []
+    points: list[tuple[float, float, str, str]] = []
     for group, (marker, colour, size) in GROUPS.items():
         chosen = [line for line in lines if _group(line["name"]) == group]
         x = [float(line["both_ms"]) for line in chosen]
         y = [max(float(line["gradient_error"]), FLOOR) for line in chosen]
-        look = {"marker": marker, "color": colour, "edgecolor": "white", "linewidth": 0.6}
+        look: dict[str, Any] = {"marker": marker, "color": colour, "edgecolor": "white", "linewidth": 0.6}
         axes.scatter(x, y, s=size, label=group, zorder=4 if marker == "*" else 3, **look)
-        points += [(*xy, _short(line["name"]), colour) for *xy, line in zip(x, y, chosen, strict=True)]
+        points += [(a, b, _short(line["name"]), colour) for a, b, line in zip(x, y, chosen, strict=True)]
     axes.set(xscale="log", yscale="log", xlabel="forward + backward, one problem [ms]")
     axes.set_ylabel("relative error of the gradient")
     axes.set_title("Oscillating masses, horizon 25: time and gradient error (lower left is better)")

@@ -67,7 +67,7 @@ def load(path: Path) -> list[RunConfig]:
     seeds, rhos = _seeds(path, table.get("seeds")), [float(rho) for rho in table.get("rho", [])]
     if any(rho <= 0 for rho in rhos) or (not rhos and set(attacks) != {"none"}):
         raise ValueError(f"{path}: `rho` must list positive numbers, got {table.get('rho')!r}.")
-    options = {name: _count(path, table, name) for name in ("steps", "replan_every")}
+    options: dict[str, Any] = {name: _count(path, table, name) for name in ("steps", "replan_every")}
     configs = []
     for plant in plants:
         for name, weights in table.get("weights", {"paper": {}}).items():

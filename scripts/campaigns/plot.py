@@ -35,7 +35,7 @@ def plot(path: Path, table: Any) -> None:
             for attack, colour in COLOURS.items():
                 rhos, errors = _by_rho(columns, here & (columns["attack"] == attack))
                 if len(rhos):
-                    look = {"color": colour, "linestyle": line, "label": NAMES[attack] + of_name}
+                    look: dict[str, Any] = {"color": colour, "linestyle": line, "label": NAMES[attack] + of_name}
                     draw_band(axes, 100 * rhos, errors, marker="o", markersize=3.5, **look)
             nominal = columns["error"][here & (columns["attack"] == "none")]
             if len(nominal) and np.median(nominal) > 1e-6:

@@ -139,8 +139,8 @@ class Case:
         lambda_g, lambda_s, *diagonals = weights or self.paper()
         Q, R = (torch.diag(torch.tensor(diagonal, dtype=torch.float64)) for diagonal in diagonals)
         lower, upper = (torch.tensor(bound, dtype=torch.float64) for bound in (self.y_min, self.y_max))
-        sets = {"u_set": dpc.Box(-self.u_max, self.u_max), "y_set": dpc.Box(lower, upper)}
-        return dpc.DPCLayer(data, Q, R, lambda_g, lambda_s, **sets, **options)
+        u_set, y_set = dpc.Box(-self.u_max, self.u_max), dpc.Box(lower, upper)
+        return dpc.DPCLayer(data, Q, R, lambda_g, lambda_s, u_set, y_set, **options)
 
     def planner(self, seed: int) -> dpc.DPCLayer:
         """Return the planning problem on the recording of a seed; made once."""

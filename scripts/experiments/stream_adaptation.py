@@ -30,7 +30,9 @@ def track(forgetting: float) -> list[float]:
     stream = dpc.HankelStream.from_data(data, forgetting=forgetting or 1.0)
     layer = dpc.DPCLayer(data, Q=10.0, R=1e-3, lambda_g=10.0, lambda_s=1e5, u_set=dpc.Box(-3.0, 3.0))
     controller = dpc.DPCController(layer, replan_every=REPLAN_EVERY)
-    us, ys, errors = [], [], []
+    us: list[torch.Tensor] = []
+    ys: list[torch.Tensor] = []
+    errors: list[float] = []
     y = plant.reset()
     for k in range(STEPS):
         if k == CHANGE:

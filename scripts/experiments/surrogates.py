@@ -65,8 +65,8 @@ def load(name: str, seed: int, every: int) -> Plant:
     y_ref, u_ref = case.references(case.horizon)
     refs = {"y_ref": y_ref} if u_ref is None else {"y_ref": y_ref, "u_ref": u_ref}
     starts = range(0, case.samples - case.t_ini, every)
-    windows = tuple(torch.stack([w[k : k + case.t_ini] for k in starts]) for w in held_out)
-    return Plant(case, own, other, windows, refs, case.target(), case.rho)
+    u_ini, y_ini = (torch.stack([w[k : k + case.t_ini] for k in starts]) for w in held_out)
+    return Plant(case, own, other, (u_ini, y_ini), refs, case.target(), case.rho)
 
 
 def surrogate(

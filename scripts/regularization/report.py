@@ -39,7 +39,10 @@ def errors(runs: Rows, case: str, point: str, split: str, attack: str, rho: floa
 
 def pair(runs: Rows, case: Case, point: str, split: str = HELD_OUT) -> tuple[np.ndarray, np.ndarray]:
     """Return the nominal and the attacked errors of a point."""
-    return tuple(errors(runs, case.name, point, split, *a) for a in (("nominal", 0.0), ("algorithm1", case.rho)))
+    nominal, attacked = (
+        errors(runs, case.name, point, split, *a) for a in (("nominal", 0.0), ("algorithm1", case.rho))
+    )
+    return nominal, attacked
 
 
 def allowed(runs: Rows, case: Case, split: str) -> float:

@@ -51,7 +51,7 @@ def searches(case_name: str, attacked_weight: float, methods: Sequence[str], ste
     """Run several searches one after the other; Optuna's have the processor time that the first one took."""
     torch.set_num_threads(1)
     case = CASES[case_name]
-    found = []
+    found: list[Found] = []
     with case.system() as plant:
         for method in methods:
             weights = case.paper() if method == ONLY_LAMBDAS else start(case)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from matplotlib import patheffects
@@ -15,7 +16,8 @@ from scripts.shared.statistics import NOMINAL, POISON
 from torch_dpc.systems import Quadrotor
 
 WIDTH, HEIGHT = 320, 260  # of each picture [pixels]
-CAMERA = {"target": (0.0, 0.15, 1.0), "distance": 1.25, "yaw": -60.0, "pitch": -38.0, "fov": 45.0}  # [m, degrees]
+# [m, degrees]
+CAMERA: dict[str, Any] = {"target": (0.0, 0.15, 1.0), "distance": 1.25, "yaw": -60.0, "pitch": -38.0, "fov": 45.0}
 TITLE = 24  # height of the line above them [pixels]
 MARGINS = {"left": 0, "bottom": 0, "right": 1, "top": HEIGHT / (HEIGHT + TITLE), "wspace": 0.01}
 PATH_COLOURS = {NOMINAL: "#0072b2", POISON: "#d55e00"}
