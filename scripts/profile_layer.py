@@ -85,7 +85,7 @@ def stages_of(layer: dpc.DPCLayer, problems: list[Problem]) -> tuple[Stages, Sta
         return solve_newton(reduction.G, reduction.Ct, start[1], lower, upper)
 
     bars, N = [torch.ones_like(found.lam) for found in solved], len(lower)
-    flat: list[Any] = [(f.active.reshape(-1, N), bar.reshape(-1, N)) for f, bar in zip(solved, bars, strict=True)]
+    flat = [(f.active.reshape(-1, N), bar.reshape(-1, N), None) for f, bar in zip(solved, bars, strict=True)]
     A, C, n = reduction.A_theta, reduction.rows.C, len(problems)
     around = {
         "checks and flattening": lambda i: _theta(layer, problems[i % n]),
@@ -98,7 +98,7 @@ def stages_of(layer: dpc.DPCLayer, problems: list[Problem]) -> tuple[Stages, Sta
         "judging the solution": lambda i: engine.judge(samples[i % n], *starts[i % n], lams[i % n], lo, up),
     }
     backward = {
-        "systems on the active rows": lambda i: adjoint(reduction.G, reduction.Ct, flat[i % n][0], flat[i % n][1], None),
+        "systems on the active rows": lambda i: adjoint(reduction.G, reduction.Ct, *flat[i % n]),
         "products with C' and A'": lambda i: (bars[i % n] @ C) @ A,
     }
     return around, inside, backward

@@ -88,7 +88,7 @@ def run_seed(name: str, seed: int, every: int) -> list[dict[str, Any]]:
         in_closed_loop = name == "masses" and (method != MORE_STEPS or knows == FULL)
         error = closed_loop(plant, victim, attack, seed)[0] if in_closed_loop else np.nan
         row: dict[str, Any] = {"plant": name, "seed": seed, "kind": kind, "knows": knows, "method": method}
-        row |= {"queries": queries, "cosine": cosine}  # the cosine with what Algorithm 1 does with full knowledge, the first of all
+        row |= {"queries": queries, "cosine": cosine}  # with Algorithm 1's p under full knowledge
         row |= {"psi": float(nominal.mean()), "decrease": decrease, "unsolved": int((~solved).sum()), "error": error}
         rows.append(row)
     full = next(row for row in rows if (row["knows"], row["method"]) == (FULL, ONE_STEP))

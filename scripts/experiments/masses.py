@@ -34,24 +34,27 @@ class Masses(Case):
     settings: ClassVar[tuple[str, str]] = ("at rest", "disturbed")
     judged: ClassVar[Tensor] = torch.diag(torch.tensor([1.0, 0.0, 0.0, 0.0]))
 
-    t_ini: int = 6
-    horizon: int = 25
-    n_g: int = 500
+    # Stated in the paper; after # what it says there, in its letters where they differ.
+    t_ini: int = 6  # sigma = 6
+    horizon: int = 25  # ell = 25
+    n_g: int = 500  # columns of the Hankel matrices: 500
     lambda_g: float = 100.0
     lambda_s: float = 1e6
-    Q: tuple[float, ...] = (10.0, 10.0, 10.0, 10.0)
-    R: tuple[float, ...] = (1.0, 1.0)
-    u_max: float = 1.0  # [N]
-    y_min: tuple[float, ...] = (-5.0, -5.0, -5.0, -5.0)  # [m, m/s]
-    y_max: tuple[float, ...] = (5.0, 5.0, 5.0, 5.0)  # [m, m/s]
-    replan_every: int = 10
-    steps: int = 200  # of 0.1 s
-    rhos: tuple[float, ...] = (0.02, 0.04, 0.10)
-    y_ref: tuple[float, ...] = (1.0, 1.0, 0.0, 0.0)  # [m, m/s]
-    u_ref: tuple[float, ...] = (1.0, 1.0)  # [N]: holds the masses at y_ref
+    Q: tuple[float, ...] = (10.0, 10.0, 10.0, 10.0)  # 10 I
+    R: tuple[float, ...] = (1.0, 1.0)  # I
+    u_max: float = 1.0  # [N]; |u| <= 1
+    y_min: tuple[float, ...] = (-5.0, -5.0, -5.0, -5.0)  # [m, m/s]; |y| <= 5
+    y_max: tuple[float, ...] = (5.0, 5.0, 5.0, 5.0)
+    replan_every: int = 10  # re-optimised every 10 steps
+    steps: int = 200  # 20 s
     dt: float = 0.1  # [s]
+    rhos: tuple[float, ...] = (0.02, 0.04, 0.10)  # 2, 4, 10 %
+    y_ref: tuple[float, ...] = (1.0, 1.0, 0.0, 0.0)  # [m, m/s]; the stationary point with unit displacement
+
+    # Not stated in the paper: our choice. docs/attacks.md has the reasons.
+    u_ref: tuple[float, ...] = (1.0, 1.0)  # [N]: the input that holds y_ref, so that the nominal error is 0
     noise: float = 0.0  # [m, m/s]: standard deviation, of every measured output
-    start_spread: float = 0.1  # [m, m/s]: standard deviation of disturbed initial states
+    start_spread: float = 0.1  # [m, m/s]: standard deviation of disturbed initial states; Figure 3 starts at y_ref
 
     # --- the closed loop ----------------------------------------------------------------------------------------------
 
