@@ -226,10 +226,10 @@ def test_the_state_can_be_kept_and_put_back():
     twin = TorchQuadrotor()
     u = commands(1, 0.5, 5)
     fly(twin, u[:20])
-    kept = twin.state
+    kept = twin.snapshot()
     first = fly(twin, u[20:40])
     for other in (copy.deepcopy(twin), pickle.loads(pickle.dumps(twin)), twin):
-        other.state = kept
+        other.restore(kept)
         assert torch.equal(fly(other, u[20:40]), first)
 
 

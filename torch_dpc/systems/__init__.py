@@ -2,6 +2,7 @@
 
 from .cart_pole import CartPole
 from .four_tanks import FourTanks
+from .gym import GymPlant
 from .masses import OscillatingMasses
 from .ode import Ode
 from .quadrotor import Quadrotor
@@ -12,6 +13,7 @@ from .torch_quadrotor import TorchQuadrotor
 __all__ = [
     "CartPole",
     "FourTanks",
+    "GymPlant",
     "Ode",
     "OscillatingMasses",
     "Quadrotor",

@@ -154,6 +154,15 @@ class TorchQuadrotor:
         """Which vehicles touched the ground or had their thrust axis below the horizon, boolean, `(*batch,)`."""
         return self.state.crashed
 
+    def snapshot(self) -> tuple[Tensor, ...]:
+        """Return the state as tensors, for `restore`."""
+        body, pid, grounded, crashed = self.state
+        return (*body, *pid, grounded, crashed)
+
+    def restore(self, snapshot: tuple[Tensor, ...]) -> None:
+        """Go back to a state that `snapshot` returned."""
+        self.state = QuadrotorState(BodyState(*snapshot[:4]), PIDState(*snapshot[4:6]), *snapshot[6:])
+
     def __repr__(self) -> str:
         flying = int((~self.grounded).sum())
         return (
