@@ -12,7 +12,7 @@ ENV := .venv/.complete
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help reproduce test bench docs lint sanitize clean distclean
+.PHONY: help reproduce test bench fuzz docs lint sanitize clean distclean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -32,6 +32,9 @@ test: $(ENV)  ## every test and docstring example (ARGS="-m 'not slow'" for the 
 
 bench: $(ENV)  ## time and error of the layer (ARGS=--quick for a short run)
 	$(PY) -m scripts.benchmark $(ARGS)
+
+fuzz: $(ENV)  ## 10,000 random problems against an independent reference (ARGS="-n 100"; resumes where it was stopped)
+	$(PY) -m tests.fuzz $(ARGS)
 
 docs: .venv/.complete-docs  ## the documentation, into site/
 	$(PY) -m sphinx -q -W --keep-going docs site
