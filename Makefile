@@ -12,7 +12,7 @@ ENV := .venv/.complete
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help reproduce test bench fuzz docs lint sanitize clean distclean
+.PHONY: help reproduce test bench fuzz docs lint package sanitize clean distclean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -57,8 +57,16 @@ sanitize: $(ENV)  ## the kernels under the address, undefined-behaviour and thre
 	$(PY) tests/solve/fuzz_kernels.py 20000 $(call SANITIZED,address) && root=$$PWD && cd build/sanitize-address/lib* && \
 	PYTHONPATH=$$PWD $$root/$(PY) -m pytest -q -p no:cacheprovider -k "not without" $$root/tests/solve/test_kernels.py
 
+# The README runs from an empty folder, so that what it imports is the wheel.
+package: $(ENV)  ## sdist and wheel into dist/, tried in a clean environment with the core dependencies alone
+	rm -rf dist build/clean && $(PY) -m build -n -o dist .
+	$(PY) -m venv build/clean
+	build/clean/bin/python -m pip --disable-pip-version-check -qq install -c constraints.txt dist/*.whl
+	mkdir -p build/empty && cd build/empty && unset PYTHONPATH && PATH=../clean/bin:$$PATH && python -W error -c 'import torch_dpc' && \
+	python ../../tests/run_readme.py ../../README.md && python -c 'from torch_dpc.solve import kernels; print("vector instructions:", kernels.instructions())'
+
 clean:  ## remove what the other targets leave, but keep .venv
-	rm -rf results site build *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
+	rm -rf results site build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
 	find . -name .venv -prune -o -name __pycache__ -type d -exec rm -rf {} +
 
 distclean: clean  ## remove .venv and the compiled kernels too

@@ -20,11 +20,10 @@ class CartPole(Ode):
     """A pole that turns freely on a cart on a straight track, with a force on the cart.
 
     With x the position of the cart, theta the angle of the pole from upright, m_c and m_p the masses, l the half-length
-    of the pole and F the force, without friction,
+    of the pole, F the force and M = m_c + m_p, without friction,
 
-        theta'' = (g sin(theta) - cos(theta) (F + m_p l theta'^2 sin(theta)) / (m_c + m_p))
-                  / (l (4/3 - m_p cos(theta)^2 / (m_c + m_p)))
-        x''     = (F + m_p l (theta'^2 sin(theta) - theta'' cos(theta))) / (m_c + m_p).
+        theta'' = (g sin(theta) - cos(theta) (F + m_p l theta'^2 sin(theta)) / M) / (l (4/3 - m_p cos(theta)^2 / M))
+        x''     = (F + m_p l (theta'^2 sin(theta) - theta'' cos(theta))) / M.
 
     The outputs are the state: x [m], x' [m/s], theta [rad], theta' [rad/s]; the input is F [N]. Theta is not wrapped, 0
     is upright and pi hangs. The track has no ends.
