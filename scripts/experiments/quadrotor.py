@@ -108,7 +108,11 @@ class Quadrotor(Case):
             yield LiesWhereItCrashed(vehicle)
 
     def record(self, plant: Any, seed: int, samples: int | None = None) -> tuple[Tensor, Tensor]:
-        """Return the commands and outputs of a random flight around the centre."""
+        """Return the commands and outputs of a random flight around the centre.
+
+        Raises:
+            RuntimeError: the vehicle crashed.
+        """
 
         def pull(y: Tensor) -> Tensor:
             return -self.pull * (y[:3] - self.centre)
@@ -123,6 +127,8 @@ class Quadrotor(Case):
             generator=generator,
             reset={"position": self.centre},
         )
+        if getattr(plant, "down", [False])[-1]:
+            raise RuntimeError(f"the vehicle crashed while the recording of seed {seed} was made, {len(u)} samples.")
         return u, y + self.noise * y.std(0) * torch.randn(y.shape, dtype=y.dtype, generator=generator)
 
     def around(self, angle: Tensor) -> Tensor:
