@@ -212,9 +212,9 @@ def main(argv: list[str] | None = None) -> None:
     lines = ["# What decides the factor between Algorithm 1 and random noise", "", f"{note}."]
     lines += [f"Fresh seeds: {FRESH_FROM} to {fresh[-1]}." if fresh else "No fresh seeds.", ""]
     lines += [
-        "Ratios are of means over the seeds, with 95 % paired bootstrap intervals. Added is the error less that of the",
-        "same seed without an attack; where its interval under random noise includes 0, random adds nothing. The band",
-        f"holds the factors of the seeds, {BAND[0]}th to {BAND[1]}th percentile; inside means that the median factor of",
+        "Ratios are of means over the seeds, with 95 % paired bootstrap intervals. Added is the error less that of",
+        "the same seed without an attack; where its interval under random noise includes 0, random adds nothing. The",
+        f"band holds the factors of the seeds, {BAND[0]}th to {BAND[1]}th percentile; inside means that the median of",
         "the fresh seeds lies within it. A crashed vehicle counts as lying where it crashed.",
         "",
         *table(flown.rows(), seeds, fresh),

@@ -75,6 +75,8 @@ def test_summary_compares_errors_and_added_errors(tmp_path):
     assert summary["nominal"]["mean"] == pytest.approx(0.15)
     assert level["ratio"] == pytest.approx(3.0)
     assert level["added_ratio"] == pytest.approx(5.0)
+    assert level["ratio_interval"] == pytest.approx([3.0, 3.0])
+    assert level["added_ratio_interval"] == pytest.approx([5.0, 5.0])
     assert (level["poison"]["min"], level["poison"]["max"]) == pytest.approx((0.6, 1.2))
     assert (level["seeds"], level["seeds_where_random_adds"]) == (2, 2)
 
@@ -83,7 +85,8 @@ def test_summary_gives_no_ratio_where_random_noise_adds_nothing(tmp_path):
     rows = saved(tmp_path, {("nominal", 0.0): 0.1, ("random", 0.01): 0.09, ("algorithm1", 0.01): 0.6})
     (level,) = summarise(rows, [0.01])["levels"]
     assert level["added_ratio"] is None and level["added_ratio_by_seed"] is None
-    assert report.times(level["added_ratio"], level["added_ratio_by_seed"]) == "random adds nothing"
+    assert level["added_ratio_interval"] is None
+    assert report.times(level["added_ratio"], level["added_ratio_interval"]) == "random adds nothing"
 
 
 def test_percent_and_first_failure_read_well():
@@ -147,6 +150,7 @@ def test_figure3_runs_and_leaves_its_files(tmp_path, capsys):
 
     report.main(["--out", str(tmp_path)])
     text = (tmp_path / "report.md").read_text()
+    assert "| Figure 3: errors on axes from 0 to 0.1 m, Algorithm 1 above random noise | " in text
     assert "figure3_masses.png" in text and "Not made: run `python -m scripts.figure4_quadrotor`" in text
 
 
