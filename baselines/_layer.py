@@ -105,7 +105,7 @@ class Judge:
     Args:
         layer: the layer whose problem it is; read now.
         tolerance: a row touches a bound within tolerance (1 + |v|), and is active if the displacement G_ii lam_i that
-            its multiplier makes is larger than that, as in :mod:`torch_dpc.solve.optimality`.
+            its multiplier makes is larger than that, as in :mod:`torch_dpc.solve.weakness`.
     """
 
     def __init__(self, layer: DPCLayer, tolerance: float):

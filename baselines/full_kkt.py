@@ -16,7 +16,7 @@ from torch import Tensor
 from torch.autograd.function import once_differentiable
 
 from torch_dpc import DPCLayer
-from torch_dpc.solve.optimality import WEAKLY_ACTIVE
+from torch_dpc.solve.weakness import WEAKLY_ACTIVE
 
 from ._adapter import Baseline, PeerResult
 from ._layer import Judge

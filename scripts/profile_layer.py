@@ -25,6 +25,7 @@ from torch import Tensor
 import torch_dpc as dpc
 from scripts.bench.cases import CYCLE, N_G, T_INI, inputs_of, layer_of, record, take
 from scripts.shared.command import RESULTS, cores, versions
+from torch_dpc.sets.bounds import Bounds
 from torch_dpc.solve import kernels
 from torch_dpc.solve.active_set import adjoint
 from torch_dpc.solve.newton import solve_newton
@@ -70,18 +71,23 @@ def calls_of(layer: dpc.DPCLayer, problems: list[Problem]) -> Stages:
 def stages_of(layer: dpc.DPCLayer, problems: list[Problem]) -> tuple[Stages, Stages, Stages]:
     """Return the stages around the solve, inside it, and of the backward; and the whole solve among the first."""
     device = torch.device("cpu")
-    _, solver = layer._factors(device)
+    solver = layer._factored(device).solver
     reduction, (lower, upper) = solver.reduction, layer.bounds(device)
+    sets = Bounds(lower, upper)
     thetas = [_theta(layer, problem) for problem in problems]
-    solved = [solver.solve(theta, lower, upper) for theta in thetas]
+    solved = [solver.solve(theta, sets, "raise") for theta in thetas]
     one = thetas[0].ndim == 1  # one problem: NumPy around the kernel; many: torch
-    engine, as_array = (solver._single, Tensor.numpy) if one else (solver._batched, lambda tensor: tensor)
+    optimality, as_array = solver.optimality, (Tensor.numpy if one else lambda tensor: tensor)
+    if one:
+        assert solver.single is not None
+        optimality = solver.single.optimality
     samples, lo, up = [as_array(theta) for theta in thetas], as_array(lower), as_array(upper)
-    starts, lams = [engine.unconstrained(sample) for sample in samples], [as_array(found.lam) for found in solved]
+    starts, lams = [optimality.unconstrained(sample) for sample in samples], [as_array(found.lam) for found in solved]
+    G = reduction.G.contiguous().numpy()
 
     def find(start: Any) -> Any:
         if one:
-            return kernels.solve_boxes(solver.arrays[2], start[1][None], lo, up)
+            return kernels.solve_boxes(G, start[1][None], lo, up)
         return solve_newton(reduction.G, reduction.Ct, start[1], lower, upper)
 
     bars, N = [torch.ones_like(found.lam) for found in solved], len(lower)
@@ -89,13 +95,13 @@ def stages_of(layer: dpc.DPCLayer, problems: list[Problem]) -> tuple[Stages, Sta
     A, C, n = reduction.A_theta, reduction.rows.C, len(problems)
     around = {
         "checks and flattening": lambda i: _theta(layer, problems[i % n]),
-        "weights and bounds unchanged?": lambda i: (layer._factors(device), layer.bounds(device)),
-        "the whole solve": lambda i: solver.solve(thetas[i % n], lower, upper),
+        "weights and bounds unchanged?": lambda i: (layer._factored(device), layer.bounds(device)),
+        "the whole solve": lambda i: solver.solve(thetas[i % n], sets, "raise"),
     }
     inside = {
-        "unconstrained minimiser": lambda i: engine.unconstrained(samples[i % n]),
+        "unconstrained minimiser": lambda i: optimality.unconstrained(samples[i % n]),
         "finding the active set": lambda i: find(starts[i % n]),
-        "judging the solution": lambda i: engine.judge(samples[i % n], *starts[i % n], lams[i % n], lo, up),
+        "judging the solution": lambda i: optimality.judge(samples[i % n], *starts[i % n], lams[i % n], lo, up),
     }
     backward = {
         "systems on the active rows": lambda i: adjoint(reduction.G, reduction.Ct, *flat[i % n]),

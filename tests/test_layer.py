@@ -359,8 +359,8 @@ def test_calls_leave_nothing_on_the_module():
     layer = small_layer()
     u_ini, y_ini = one()
     layer(u_ini, y_ini)
-    kept = {k: v for k, v in vars(layer).items() if k != "_cache"}
-    entries = len(layer._cache)
+    kept = {k: v for k, v in vars(layer).items() if k != "_factors"}
+    entries = len(layer._factors)
     for _ in range(3):
         layer(u_ini, y_ini.clone().requires_grad_(), y_ref=Y_REF).u.sum().backward()
-    assert {k: v for k, v in vars(layer).items() if k != "_cache"} == kept and len(layer._cache) == entries
+    assert {k: v for k, v in vars(layer).items() if k != "_factors"} == kept and len(layer._factors) == entries

@@ -80,8 +80,7 @@ def window(name: str, value: Any, steps: int, channels: int, symbol: str) -> Ten
     tensor = as_data(name, value, finite=False)  # values are looked at inside the Function: here it would break vmap
     if tensor.shape[-2:] != (steps, channels):
         raise ValueError(
-            f"`{name}` must have shape (*batch, t_ini, {symbol}) = (*, {steps}, {channels}), "
-            f"got {tuple(tensor.shape)}."
+            f"`{name}` must have shape (*batch, t_ini, {symbol}) = (*, {steps}, {channels}), got {tuple(tensor.shape)}."
         )
     return tensor
 

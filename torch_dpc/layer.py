@@ -10,26 +10,21 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from .autodiff import carries_derivative, untransformed
-from .batching import times
 from .checks import one_batch, reference, window, with_one_batch
 from .data.hankel import HankelData
 from .data.hankel_batch import HankelBatch
-from .errors import Status
-from .function import solve_reduced
+from .factors import Factored, Factors, problem_of
 from .problem.compact_form import CompactForm, compact_form
-from .problem.projected_kkt import FullSystem
-from .problem.reduction import Reduction, reduce
-from .problem.rows import DataRows
+from .problem.reduction import Reduction
 from .problem.terms import Sizes, Terms
-from .problem.weights import Weights, penalty, weight_matrix
 from .saving import load_layer, save_layer
 from .sets import ConvexSet
+from .sets.bounds import Bounds
 from .sets.feasible import FeasibleSet
-from .settings import DOORS, Setup, check_choice, settings_of
-from .solution import DPCSolution, SolveInfo
-from .solve.convex_solve import ConvexSolver
-from .solve.solver import Planned, Solver
+from .settings import VALIDATORS, GivenWeights, Settings, Setup, check_choice
+from .solution import DPCSolution, solution_of
+from .solve.derivative import plan
+from .solve.engines import Sets
 
 
 class DPCLayer(nn.Module):
@@ -100,8 +95,8 @@ class DPCLayer(nn.Module):
         on_failure: str = "raise",
     ):
         super().__init__()
-        self._setup_cache: tuple[tuple[Any, ...], Setup] | None = None
-        self._cache: dict[tuple[str, torch.device], tuple[tuple[Any, ...], Any]] = {}
+        self._setup_cache: tuple[Settings, Setup] | None = None
+        self._factors = Factors()
         self.data = data
         self.Q, self.R, self.lambda_g, self.lambda_s = Q, R, lambda_g, lambda_s
         self.lambda_u, self.R_du = lambda_u, R_du
@@ -113,25 +108,33 @@ class DPCLayer(nn.Module):
         self.backward_system = backward
         self.solver = solver
         self.on_failure = on_failure
-        cpu = torch.device("cpu")
-        weights = self._weights(cpu)  # bad weights and bounds are told now, not at the first call
-        if self._setup.is_box:
-            self.bounds(cpu)
-        one_batch([*self._batches_of(weights), *self.feasible_set.batches(cpu)])
+        cpu = torch.device("cpu")  # bad weights and sets are reported now, not at the first call
+        problem = problem_of(self._setup, self._given, cpu)
+        self._factors.sets(self._setup, cpu)
+        one_batch([*problem.batches, *self.feasible_set.batches(cpu)])
 
     def __setattr__(self, name: str, value: Any) -> None:
         """Assign; a setting is checked first, as the constructor checks it."""
-        door = DOORS.get(name)
-        super().__setattr__(name, value if door is None else door(name, value))
+        validate = VALIDATORS.get(name)
+        super().__setattr__(name, value if validate is None else validate(name, value))
 
     @property
     def _setup(self) -> Setup:
-        """What follows from the settings, made anew when one of them has changed."""
-        now = settings_of(self.__dict__)
+        """What follows from the settings, derived again when one of them has changed."""
+        now = Settings.of(self.__dict__)
         kept = self._setup_cache
         if kept is None or kept[0] != now:
-            kept = self._setup_cache = (now, Setup.of(self))
+            kept = self._setup_cache = (now, Setup.of(now))
         return kept[1]
+
+    @property
+    def _given(self) -> GivenWeights:
+        """The weights as they are now."""
+        return GivenWeights(self.Q, self.R, self.lambda_g, self.lambda_s, self.lambda_u, self.R_du)
+
+    def _factored(self, device: torch.device) -> Factored:
+        """Return the reduced problem of the present weights and its solver."""
+        return self._factors.factored(self._setup, self._given, device)
 
     @property
     def backward(self) -> str:
@@ -155,7 +158,7 @@ class DPCLayer(nn.Module):
     @property
     def reduction(self) -> Reduction:
         """The reduced problem of the present weights; see :mod:`torch_dpc.problem.reduction`."""
-        return self._factors(self.data.device)[0]
+        return self._factored(self.data.device).reduction
 
     @property
     def feasible_set(self) -> FeasibleSet:
@@ -202,13 +205,7 @@ class DPCLayer(nn.Module):
 
     def _call(self, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any, on_failure: str | None) -> DPCSolution:
         theta, dtype = self.flatten(u_ini, y_ini, y_ref, u_ref)
-        if self._setup.is_box:
-            return self.plan(theta, *self.bounds(theta.device), dtype=dtype, on_failure=on_failure)
-        reduction, solver = self._factors(theta.device)
-        batches = [("the samples", theta.shape[:-1]), *self._batches_of(reduction.weights)]
-        one_batch([*batches, *self.feasible_set.batches(theta.device)])
-        planned = _with_failures(solver, on_failure).plan(theta, reduction)
-        return self._solution(planned, theta, reduction, solver, dtype)
+        return self._plan(theta, self._factors.sets(self._setup, theta.device), dtype, on_failure)
 
     def plan(
         self,
@@ -219,7 +216,7 @@ class DPCLayer(nn.Module):
         dtype: torch.dtype = torch.float64,
         on_failure: str | None = None,
     ) -> DPCSolution:
-        """Plan for flattened parameters and bounds of one's own; what a call does after its checks.
+        """Plan for flattened parameters and bounds of one's own, if the sets of the layer are boxes.
 
         Args:
             theta: (u_ini, y_ini, u_ref, y_ref) flattened, `(*batch, n_theta)`, float64.
@@ -227,25 +224,27 @@ class DPCLayer(nn.Module):
             dtype: of the plan.
             on_failure: in place of the layer's own.
         """
-        reduction, solver = self._factors(theta.device)
-        if lower.ndim > 1 or upper.ndim > 1 or reduction.V.ndim > 2:
-            bounds = [("lower", lower.shape[:-1]), ("upper", upper.shape[:-1])]
-            one_batch([("the samples", theta.shape[:-1]), *self._batches_of(reduction.weights), *bounds])
-        planned = solve_reduced(_with_failures(solver, on_failure), theta, reduction, lower, upper)
-        return self._solution(planned, theta, reduction, solver, dtype)
+        return self._plan(theta, Bounds(lower, upper), dtype, on_failure)
 
-    def _solution(
-        self, planned: Planned, theta: Tensor, reduction: Reduction, solver: Any, dtype: torch.dtype
-    ) -> DPCSolution:
-        u, y, lam, _, info = planned
-        data = self.data  # g is made later, and is of these
-        return DPCSolution(
-            u=u if dtype == torch.float64 else u.to(dtype),
-            y=y if dtype == torch.float64 else y.to(dtype),
-            info=SolveInfo(info, reduction.is_selection, lambda: _nonsingular(data, solver, theta, planned)),
-            lam=lam,
-            _make_g=lambda: _g(data, reduction, theta, lam, info).to(dtype),
-        )
+    def _plan(self, theta: Tensor, sets: Sets, dtype: torch.dtype, on_failure: str | None) -> DPCSolution:
+        factored = self._factored(theta.device)
+        batches = sets.batches(theta.device)
+        if batches or factored.reduction.V.ndim > 2:
+            one_batch([("the samples", theta.shape[:-1]), *factored.problem.batches, *batches])
+        on_failure = self.on_failure if on_failure is None else check_choice("on_failure", on_failure)
+        planned = plan(factored.solver, theta, factored.reduction, sets, on_failure)
+        return solution_of(planned, theta, sets, self.data, factored.reduction, factored.solver, dtype)
+
+    def bounds(self, device: torch.device) -> tuple[Tensor, Tensor]:
+        """Return the bounds of (u, y, du) flattened, `(N,)` or `(*batch, N)` each, float64, with their graph.
+
+        Raises:
+            ValueError: a set is no box.
+        """
+        sets = self._factors.sets(self._setup, device)
+        if not isinstance(sets, Bounds):
+            raise ValueError("the sets of this layer are not all boxes: they have no bounds.")
+        return sets.tensors
 
     def compact_form(self, u_ini: Any, y_ini: Any, *, y_ref: Any = None, u_ref: Any = None) -> CompactForm:
         """Return the problem as the paper writes it, minimise 1/2 z'Pz + q'z subject to H z = b, z in D.
@@ -253,7 +252,7 @@ class DPCLayer(nn.Module):
         The arguments are those of the call. P is `(n, n)`, q `(*batch, n)`, H `(m, n)`, b `(*batch, m)`, float64.
         """
         theta, _ = self.flatten(u_ini, y_ini, y_ref, u_ref)
-        weights = self._weights(theta.device)
+        weights = problem_of(self._setup, self._given, theta.device).weights
         if weights.are_batched or isinstance(self.data, HankelBatch):
             raise ValueError("`compact_form` takes one problem; the weights or the data have a batch dimension.")
         if self.du_set is not None:
@@ -340,134 +339,12 @@ class DPCLayer(nn.Module):
             theta = torch.cat([part.flatten(-2) for part in with_one_batch(parts)], dim=-1)
         return (theta if theta.dtype == torch.float64 else theta.double()), dtype
 
-    def _weights(self, device: torch.device) -> Weights:
-        """Return the weights as float64 tensors of the whole horizon, with their graph."""
-        data = self.data
-        weights = Weights(
-            Q=weight_matrix("Q", self.Q, data.n_y, data.horizon).to(device),
-            R=weight_matrix("R", self.R, data.n_u, data.horizon).to(device),
-            lambda_g=penalty("lambda_g", self.lambda_g).to(device),
-            lambda_s=penalty("lambda_s", self.lambda_s).to(device),
-            lambda_u=None if self.lambda_u is None else penalty("lambda_u", self.lambda_u).to(device),
-            R_du=None if self.R_du is None else weight_matrix("R_du", self.R_du, data.n_u, data.horizon).to(device),
-        )
-        one_batch(self._batches_of(weights))
-        return weights
-
-    def _batches_of(self, weights: Weights) -> list[tuple[str, torch.Size]]:
-        """Return the batch dimensions of the weights and of the data, by name."""
-        batches = [(name, x.shape[: x.ndim - weights.TAILS[name]]) for name, x in weights.tensors.items()]
-        if isinstance(self.data, HankelBatch):
-            batches.append(("data", torch.Size([len(self.data.members)])))
-        return batches
-
-    def _factors(self, device: torch.device) -> tuple[Reduction, Any]:
-        """Return the reduced problem and its solver; with a graph, which must not outlive the call, made each time."""
-        weights = (self.Q, self.R, self.lambda_g, self.lambda_s, self.lambda_u, self.R_du)
-        if carries_derivative((*weights, *self.data.matrices)):
-            return self._factor(device)
-        # The matrices of the data are constants of a frozen object: the object stands for them.
-        return self._cached(("factors", device), (*weights, self._setup.of_factors), self._factor, device)
-
-    def bounds(self, device: torch.device) -> tuple[Tensor, Tensor]:
-        """Return the bounds of (u, y, du) flattened, `(N,)` or `(*batch, N)` each, float64, with their graph.
-
-        Raises:
-            ValueError: a set is no box.
-        """
-        setup = self._setup
-        sets = setup.sets
-        if not setup.is_box:
-            raise ValueError("the sets of this layer are not all boxes: they have no bounds.")
-        sources = tuple(bound for owner, _ in sets.parts for bound in (owner.lower, owner.upper))
-        if carries_derivative(sources):
-            return sets.bounds(device)
-        return self._cached(("bounds", device), (*sources, sets), sets.bounds, device)
-
-    def _cached(self, key: tuple[str, torch.device], sources: tuple[Any, ...], make: Any, *args: Any) -> Any:
-        """Return what `make` makes of the sources, made anew when their values have changed."""
-        entry = self._cache.get(key)
-        if entry is None or not all(map(_is_same, entry[0], sources)):
-            with torch.inference_mode(False), torch.no_grad(), untransformed():  # later calls may differentiate
-                kept = tuple(s.detach().clone() if isinstance(s, Tensor) else s for s in sources)
-                entry = self._cache[key] = (kept, make(*args))
-        return entry[1]
-
-    def _rows(self, device: torch.device) -> DataRows:
-        """Return the rows of the data; weights that learn leave them alone."""
-        if carries_derivative(self.data.matrices):
-            return _rows_of(self.data, device, self.terms)
-        terms = self.terms
-        return self._cached(("rows", device), (self.data, terms), _rows_of, self.data, device, terms)
-
-    def _factor(self, device: torch.device) -> tuple[Reduction, Solver | ConvexSolver]:
-        reduction = reduce(self._rows(device), self._weights(device))
-        detached, setup = reduction.detach(), self._setup
-        if not setup.is_box:
-            return reduction, ConvexSolver(detached, setup.sizes, setup.sets, self.on_failure)
-        full = None
-        if self.backward_system == "full":
-            if carries_derivative((reduction.V,)) or reduction.V.ndim > 2:
-                raise ValueError(
-                    'backward="full" differentiates with respect to measurements and references of one problem; '
-                    'use backward="reduced" for weights or data that learn, or have a batch dimension.'
-                )
-            if setup.terms != Terms():
-                raise ValueError('backward="full" is the system of the paper\'s problem; use backward="reduced".')
-            assert isinstance(self.data, HankelData)  # batches were refused with the batched reductions
-            full = FullSystem(self.data, detached.weights)
-        return reduction, Solver(detached, setup.sizes, self.solver, self.on_failure, full)
-
     def __getstate__(self) -> dict[str, Any]:
         """Leave the factors out of copies and pickles: they are made again when needed."""
-        return {**self.__dict__, "_cache": {}, "_setup_cache": None}
-
-
-def _nonsingular(data: HankelData | HankelBatch, solver: Any, theta: Tensor, planned: Planned) -> Tensor:
-    reduction = solver.reduction
-    # The part of g that the data do not see is fixed by lambda_g alone.
-    fixed = (reduction.weights.lambda_g > 0) | data.spans_all.to(theta.device)
-    decided = reduction.rows.Eq_range is None and not reduction.is_selection
-    with torch.no_grad():
-        return solver.independent(theta.detach(), planned) & fixed & decided
-
-
-def _g(data: HankelData | HankelBatch, reduction: Reduction, theta: Tensor, lam: Tensor, info: Tensor) -> Tensor:
-    data.require_windows()
-    a = times(reduction.A_theta, theta) - times(reduction.A_lam, lam)
-    g = times(basis := data.basis.to(a.device), a)
-    if carries_derivative((reduction.rows.C,)):  # g = D^+ (D g), so that the data behind D are differentiated too
-        D = data.stacked.to(a.device)
-        g = times(torch.linalg.pinv(D, rtol=1e-10), times(D @ basis, a))
-    return torch.where(info[..., :1] == Status.SOLVED, g, torch.nan)
-
-
-def _rows_of(data: HankelData | HankelBatch, device: torch.device, terms: Terms) -> DataRows:
-    if isinstance(data, HankelData):
-        return DataRows.of(data, device, terms)
-    return DataRows.stack([DataRows.of(one, device, terms) for one in data.members])
+        return {**self.__dict__, "_factors": Factors(), "_setup_cache": None}
 
 
 @functools.cache
 def _uncompiled() -> Any:
     """`DPCLayer._call` out of the compiler's reach; made when it is there, because importing it takes a second."""
     return torch.compiler.disable(DPCLayer._call)
-
-
-def _with_failures(solver: Any, on_failure: str | None) -> Any:
-    if on_failure is None or on_failure == solver.on_failure:
-        return solver
-    check_choice("on_failure", on_failure)
-    return solver.with_failures(on_failure)
-
-
-def _is_same(kept: Any, now: Any) -> bool:
-    """Compare values: version counters would be cheaper, but miss edits through `.data`."""
-    if kept is now:  # no tensor: those are kept as copies
-        return True
-    if isinstance(kept, Tensor) and isinstance(now, Tensor):
-        if kept.device != now.device:
-            kept = kept.to(now.device)
-        return kept.dtype == now.dtype and torch.equal(kept, now)
-    plain = (int, float, str, tuple, Terms)
-    return isinstance(kept, plain) and isinstance(now, plain) and kept == now

@@ -1,21 +1,22 @@
 """The settings of a layer: what each may be, and what follows from all of them as they are now.
 
-A setting is checked where it is assigned. What two of them must agree on is checked where they are used, so that one
-may be changed after the other: :meth:`Setup.of` derives it, and a layer asks for it again when `settings_of` differs.
+A setting is checked when it is assigned. Conditions on several settings are checked when a layer is used, so that one
+setting may be changed after the other: :meth:`Setup.of` checks them, again whenever :class:`Settings` have changed.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any
+from functools import cached_property
+from typing import Any, NamedTuple
 
 from .checks import as_index
 from .data.hankel import HankelData
 from .data.hankel_batch import HankelBatch
 from .problem.terms import Sizes, Terms
 from .sets import ConvexSet, Reals
-from .sets.feasible import FeasibleSet, outline
+from .sets.feasible import FeasibleSet, identity_key
 
 #: The settings that take one of a few words.
 CHOICES = {
@@ -26,72 +27,103 @@ CHOICES = {
 }
 
 
+class GivenWeights(NamedTuple):
+    """The weights of a layer as they were given: numbers, tensors or parameters; None for terms that are not there."""
+
+    Q: Any
+    R: Any
+    lambda_g: Any
+    lambda_s: Any
+    lambda_u: Any
+    R_du: Any
+
+
+class Settings(NamedTuple):
+    """The settings of a layer besides its weights, to compare by `==`.
+
+    A set is given by :func:`torch_dpc.sets.feasible.identity_key`, whose first entry is the set itself.
+    """
+
+    data: HankelData | HankelBatch
+    u_set: tuple[Any, ...]
+    y_set: tuple[Any, ...]
+    du_set: tuple[Any, ...] | None
+    regularizer: str
+    terminal_steps: int
+    has_lambda_u: bool
+    has_R_du: bool
+    backward: str
+    solver: str
+
+    @staticmethod
+    def of(held: dict[str, Any]) -> Settings:
+        """Read the settings from the dictionary of a layer.
+
+        They are read at every call, and a module's own access to its children takes 0.3 us each.
+        """
+        modules = held["_modules"]
+        du_set = modules.get("du_set")
+        return Settings(
+            held["data"],
+            identity_key(modules["u_set"]),
+            identity_key(modules["y_set"]),
+            None if du_set is None else identity_key(du_set),
+            held["regularizer"],
+            held["terminal_steps"],
+            _is_given("lambda_u", held),
+            _is_given("R_du", held),
+            held["backward_system"],
+            held["solver"],
+        )
+
+
 @dataclass(frozen=True, eq=False)
 class Setup:
     """What follows from the settings of a layer.
 
     Attributes:
+        data: the recorded trajectories.
         terms: which terms the problem has beyond the paper's.
         sizes: the parts of theta and of v.
         sets: all sets of the problem as one.
-        is_box: whether they are a box together.
-        of_factors: what the factors hang on besides the weights, to compare by `==`. Boxes are no part of it: their
-            bounds are read at every call.
+        backward: "reduced" or "full".
+        solver: "auto", "newton" or "daqp".
     """
 
+    data: HankelData | HankelBatch
     terms: Terms
     sizes: Sizes
     sets: FeasibleSet
-    is_box: bool
-    of_factors: tuple[Any, ...]
+    backward: str
+    solver: str
+
+    @cached_property
+    def of_factors(self) -> tuple[Any, ...]:
+        """What the factors depend on besides the weights, to compare by `==`."""
+        return self.solver, self.backward, self.data, self.terms, self.sets.structure_key
 
     @staticmethod
-    def of(layer: Any) -> Setup:
-        """Derive it.
+    def of(settings: Settings) -> Setup:
+        """Derive the setup.
 
         Raises:
             ValueError: settings that do not go together, or not with the data.
         """
-        data, steps = layer.data, layer.terminal_steps
+        data, steps = settings.data, settings.terminal_steps
         if not 0 <= steps <= data.horizon:
             raise ValueError(
                 f"`terminal_steps` must be an integer from 0 to the horizon, {data.horizon}, got {steps!r}."
             )
-        rates = layer.R_du is not None or layer.du_set is not None
-        terms = Terms(layer.regularizer == "identity", layer.lambda_u is not None, rates, steps)
+        rates = settings.has_R_du or settings.du_set is not None
+        terms = Terms(settings.regularizer == "identity", settings.has_lambda_u, rates, steps)
         if terms.slack and terms.rates:
             raise ValueError("`R_du` and `du_set` count from the last u_ini, which `lambda_u` leaves open: give one.")
-        named = [("u_set", layer.u_set, data.n_u), ("y_set", layer.y_set, data.n_y)]
+        named = [("u_set", settings.u_set[0], data.n_u), ("y_set", settings.y_set[0], data.n_y)]
         if rates:
-            named.append(("du_set", Reals() if layer.du_set is None else layer.du_set, data.n_u))
+            named.append(("du_set", Reals() if settings.du_set is None else settings.du_set[0], data.n_u))
         sets = FeasibleSet.of((name, owner, data.horizon, n) for name, owner, n in named)
-        engine = layer.solver, layer.on_failure, layer.backward_system
-        is_box = sets.is_box
-        if not is_box and (layer.backward_system == "full" or layer.solver != "auto"):
-            raise ValueError('`backward="full"` and the choice of a `solver` are for sets that are boxes.')
-        return Setup(terms, Sizes.of(data, terms), sets, is_box, (*engine, data, terms, None if is_box else sets))
-
-
-def settings_of(held: dict[str, Any]) -> tuple[Any, ...]:
-    """Return what a :class:`Setup` hangs on, to compare by `==`; `held` is the dictionary of the layer.
-
-    It is read at every call, and a module's own way to its parts takes 0.3 us each.
-    """
-    modules = held["_modules"]
-    du_set = modules.get("du_set")
-    return (
-        held["data"],
-        held["regularizer"],
-        held["terminal_steps"],
-        _is_given("lambda_u", held),
-        _is_given("R_du", held),
-        held["backward_system"],
-        held["solver"],
-        held["on_failure"],
-        outline(modules["u_set"]),
-        outline(modules["y_set"]),
-        None if du_set is None else outline(du_set),
-    )
+        sets.check_engine(settings.solver)
+        return Setup(data, terms, Sizes.of(data, terms), sets, settings.backward, settings.solver)
 
 
 def _is_given(name: str, held: dict[str, Any]) -> bool:
@@ -99,9 +131,6 @@ def _is_given(name: str, held: dict[str, Any]) -> bool:
     if name in held:
         return held[name] is not None
     return held["_parameters"].get(name, held) is not None
-
-
-# --- one by one -------------------------------------------------------------------------------------------------------
 
 
 def check_choice(name: str, value: Any) -> str:
@@ -143,8 +172,8 @@ def _backward(_: str, value: Any) -> str:
     return check_choice("backward", value)
 
 
-#: What an attribute of a layer goes through when it is assigned.
-DOORS: Mapping[str, Callable[[str, Any], Any]] = {
+#: The check of each attribute of a layer, applied when it is assigned.
+VALIDATORS: Mapping[str, Callable[[str, Any], Any]] = {
     "data": _data,
     "u_set": _set,
     "y_set": _set,

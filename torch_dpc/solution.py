@@ -6,9 +6,18 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
+import torch
 from torch import Tensor
 
+from .autodiff import carries_derivative
+from .batching import times
+from .data.hankel import HankelData
+from .data.hankel_batch import HankelBatch
 from .errors import Status
+from .problem.reduction import Reduction
+from .solve.engines import Sets
+from .solve.outcome import Planned
+from .solve.solver import Solver
 
 
 class SolveInfo:
@@ -88,3 +97,45 @@ class DPCSolution:
         """Return one sample of a batch."""
         info = SolveInfo(self.info.table[i], self.info.is_selection, lambda: self.info.nonsingular[i])
         return DPCSolution(self.u[i], self.y[i], info, self.lam[i], lambda: self.g[i])
+
+
+def solution_of(
+    planned: Planned,
+    theta: Tensor,
+    sets: Sets,
+    data: HankelData | HankelBatch,
+    reduction: Reduction,
+    solver: Solver,
+    dtype: torch.dtype,
+) -> DPCSolution:
+    """Return what a call of the layer returns; g is computed from these arguments when first asked for."""
+    is_double = dtype == torch.float64
+    return DPCSolution(
+        u=planned.u if is_double else planned.u.to(dtype),
+        y=planned.y if is_double else planned.y.to(dtype),
+        info=SolveInfo(
+            planned.info, reduction.is_selection, lambda: _nonsingular(data, reduction, solver, theta, planned, sets)
+        ),
+        lam=planned.lam,
+        _make_g=lambda: _g(data, reduction, theta, planned.lam, planned.info).to(dtype),
+    )
+
+
+def _nonsingular(
+    data: HankelData | HankelBatch, reduction: Reduction, solver: Solver, theta: Tensor, planned: Planned, sets: Sets
+) -> Tensor:
+    with torch.no_grad():
+        # The part of g that the data do not see is fixed by lambda_g alone.
+        fixed = (solver.reduction.weights.lambda_g > 0) | data.spans_all.to(theta.device)
+        decided = solver.reduction.rows.Eq_range is None and not reduction.is_selection
+        return solver.independent(planned, sets) & fixed & decided
+
+
+def _g(data: HankelData | HankelBatch, reduction: Reduction, theta: Tensor, lam: Tensor, info: Tensor) -> Tensor:
+    data.require_windows()
+    a = times(reduction.A_theta, theta) - times(reduction.A_lam, lam)
+    g = times(basis := data.basis.to(a.device), a)
+    if carries_derivative((reduction.rows.C,)):  # g = D^+ (D g), so that the data behind D are differentiated too
+        D = data.stacked.to(a.device)
+        g = times(torch.linalg.pinv(D, rtol=1e-10), times(D @ basis, a))
+    return torch.where(info[..., :1] == Status.SOLVED, g, torch.nan)

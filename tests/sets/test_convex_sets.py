@@ -24,6 +24,7 @@ from helpers import (
 )
 
 #: An interior-point method at its tightest.
+FULL = 1e-6  # the paper's system, condition about 1e14 before its scaling
 CONE_SOLVER = 1e-6
 DIFFERENCES = 1e-6
 EXACT = 1e-10
@@ -388,6 +389,41 @@ def test_any_leading_shape(batch):
     assert relative(sol.u.reshape(-1, 6, 2), expected[:count]) < EXACT if count else True
 
 
+@pytest.mark.parametrize("case", ["ball", "cone of outputs", "product", "soft outputs"])
+def test_the_papers_full_system_gives_the_same_derivative(case):
+    u_ini, y_ini = inputs()
+    x = y_ini.clone().requires_grad_()
+    bars = []
+    for backward in ("reduced", "full"):
+        sol = layer_of(case, backward=backward)(u_ini, x, y_ref=Y_REF)
+        loss = (randn(*sol.u.shape, seed=1) * sol.u).sum() + (randn(*sol.lam.shape, seed=2) * sol.lam).sum()
+        bars.append(torch.autograd.grad(loss, x)[0])
+    assert (sol.info.n_active > 0).any() and relative(bars[1], bars[0]) < FULL
+
+
+def test_the_full_system_reaches_a_radius_and_derives_once():
+    radius = torch.nn.Parameter(torch.tensor(0.4, dtype=torch.float64))
+    u_ini, y_ini = inputs()
+    bars = []
+    for backward in ("reduced", "full"):
+        sol = layer_of("ball", u_set=dpc.Ball(radius), backward=backward)(u_ini, y_ini, y_ref=Y_REF)
+        bars.append(torch.autograd.grad((randn(*sol.u.shape, seed=1) * sol.u).sum(), radius)[0])
+    assert bars[0].abs() > 1e-3 and relative(bars[1], bars[0]) < FULL
+    (bar,) = torch.autograd.grad(
+        layer_of("ball", u_set=dpc.Ball(radius), backward="full")(u_ini, y_ini, y_ref=Y_REF).u.sum(),
+        radius,
+        create_graph=True,
+    )
+    with pytest.raises(NotImplementedError, match="gives first derivatives"):
+        bar.backward()
+
+
+def test_newton_may_be_named_for_any_set():
+    u_ini, y_ini = inputs()
+    plans = [layer_of("ball", solver=solver)(u_ini, y_ini, y_ref=Y_REF).u for solver in ("auto", "newton")]
+    assert relative(plans[1], plans[0]) < EXACT
+
+
 def test_a_sweep_of_weights_is_one_call():
     u_ini, y_ini = (x[0] for x in inputs())
     sweep = torch.tensor([0.1, 1.0, 10.0], dtype=torch.float64)
@@ -420,14 +456,14 @@ def test_a_set_learns_and_its_change_is_seen():
     [
         ({"u_set": dpc.Ball(1.0, torch.zeros(3))}, "`u_set` does not fit 2 channels over 6 steps"),
         ({"y_set": dpc.Product([(dpc.Ball(1.0), [0, 1])])}, "`y_set`|the product has 2 channels, the plan 4"),
-        ({"u_set": dpc.Ball(1.0), "backward": "full"}, "for sets that are boxes"),
+        ({"u_set": dpc.Ball(1.0), "lambda_u": 1.0, "backward": "full"}, "is the system of the paper"),
         ({"u_set": dpc.Ball(1.0), "solver": "daqp"}, "for sets that are boxes"),
         ({"u_set": 1.0}, "`u_set` must be a ConvexSet or None"),
     ],
 )
 def test_bad_layers_are_named(options, says):
     with pytest.raises(ValueError, match=says):
-        dpc.DPCLayer(small_data(), **{**SMALL, **options})
+        dpc.DPCLayer(small_data(), **{**SMALL, **options})(*inputs())
 
 
 @pytest.mark.skipif(not torch.cuda.is_available(), reason="needs a CUDA device")

@@ -266,9 +266,9 @@ def test_weights_spoilt_later_are_told_at_the_next_call():
         ({"lambda_s": None}, "`lambda_s` must be a number or a tensor, got None"),
         ({"u_set": (-1.0, 1.0)}, "`u_set` must be a ConvexSet or None, got tuple"),
         ({"u_set": dpc.Box(torch.zeros(3), 1.0)}, r"bounds of `u_set` .*got \(3,\)"),
-        ({"solver": "newton", "u_set": dpc.Ball(1.0)}, "are for sets that are boxes"),
-        ({"u_set": dpc.Ball(1.0), "solver": "newton"}, "are for sets that are boxes"),
-        ({"backward": "full", "u_set": dpc.Ball(1.0)}, "are for sets that are boxes"),
+        ({"solver": "daqp", "u_set": dpc.Ball(1.0)}, "is for sets that are boxes"),
+        ({"u_set": dpc.Ball(1.0), "solver": "daqp"}, "is for sets that are boxes"),
+        ({"backward": "full", "du_set": dpc.Ball(1.0)}, 'backward="full" is the system of the paper'),
         ({"backward": "full", "lambda_u": 1.0}, 'backward="full" is the system of the paper'),
         ({"data": 3}, "`data` must be a HankelData or a HankelBatch, got int"),
         ({"Q": torch.eye(4), "data": delayed_layer().data}, "`u_ini` must have shape .* got"),
@@ -302,7 +302,7 @@ def test_parameters_of_sets_spoilt_later_are_told_at_the_next_call():
 
 
 def test_a_setting_that_does_not_fit_may_be_on_the_way_to_one_that_does():
-    layer = small_layer(backward="full", solver="newton")
+    layer = small_layer(backward="full", solver="daqp")
     layer.u_set = dpc.Ball(0.3)
     layer.backward, layer.solver = "reduced", "auto"
     assert float(layer(u_ini, y_ini, y_ref=Y_REF).u.norm(dim=-1).amax()) == pytest.approx(0.3, abs=1e-9)

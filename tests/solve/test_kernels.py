@@ -65,7 +65,7 @@ def test_random_boxes_meet_their_conditions(n, shared):
 @pytest.mark.parametrize("n", [9, 33, 70])
 def test_the_kernel_is_the_iteration_of_torch(n):
     G, Ct, v0, lower, upper = problem(n, seed=n, width=2.0)
-    found, together = newton.solve_newton(G, Ct, v0, lower, upper), newton._together(G, Ct, v0, lower, upper)
+    found, together = newton.solve_newton(G, Ct, v0, lower, upper), newton._batched(G, Ct, v0, lower, upper)
     assert together.converged.sum() >= 6
     for i in together.converged.nonzero()[:, 0]:
         assert relative(found.lam[i], together.lam[i]) < SAME

@@ -1,9 +1,9 @@
 """The compact form of the problem, as the paper writes it.
 
-    minimise over u, y, g   1/2 |y - y_ref|_Q^2 + 1/2 |u - u_ref|_R^2 + lambda_g |M g|^2 + lambda_s |Yp g - y_ini|^2
-    subject to              Up g = u_ini,  u = Uf g,  y = Yf g,  u in U,  y in Y
+minimise over u, y, g   1/2 |y - y_ref|_Q^2 + 1/2 |u - u_ref|_R^2 + lambda_g |M g|^2 + lambda_s |Yp g - y_ini|^2
+subject to              Up g = u_ini,  u = Uf g,  y = Yf g,  u in U,  y in Y
 
-    M = I - W^+ W,  W = [Up; Yp; Uf]
+M = I - W^+ W,  W = [Up; Yp; Uf]
 """
 
 from __future__ import annotations

@@ -14,12 +14,10 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
 
 import torch
 from torch import Tensor
 
-from ..batching import flatten_batch, lead_all
 from ..data.hankel import HankelData
 from .compact_form import CompactForm, compact_form
 from .terms import Sizes
@@ -38,17 +36,24 @@ def optimality_map(form: CompactForm, z: Tensor, w: Tensor, lower: Tensor, upper
     return torch.cat([z - projected, H @ z - b])
 
 
-def jacobian(P: Tensor, H: Tensor, free: Tensor) -> Tensor:
+def jacobian(P: Tensor, H: Tensor, D1: Tensor) -> Tensor:
     """Return J of Proposition 1, `(n + m, n + m)`.
 
     Args:
         P, H: of the compact form.
-        free: the diagonal of D1, `(n,)`: 1 where the projection passes, 0 at a bound.
+        D1: the Jacobian of the projection, `(n, n)`, or its diagonal `(n,)`: 1 where a row is free, 0 at a bound.
     """
     n, m = len(P), len(H)
     eye = torch.eye(n, dtype=P.dtype, device=P.device)
-    top = torch.cat([eye - free[:, None] * (eye - P), free[:, None] * H.T], dim=1)
+    top = torch.cat([eye - _apply(D1, eye - P), _apply(D1, H.T)], dim=1)
     return torch.cat([top, torch.cat([H, H.new_zeros(m, m)], dim=1)])
+
+
+def _apply(D1: Tensor, matrix: Tensor) -> Tensor:
+    """Return D1 matrix for the leading block of D1, or the diagonal of that; the rest of D1 is the identity."""
+    k = len(D1)
+    rows = D1[:, None] * matrix[:k] if D1.ndim == 1 else D1 @ matrix[:k]
+    return rows if k == len(matrix) else torch.cat([rows, matrix[k:]])
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,10 +63,25 @@ class FullSystem:
     Attributes:
         data: the recorded data.
         weights: one problem's, without a graph.
+        is_diagonal: whether D1 is diagonal and given as the rows held at a bound, `(*batch, N)`, boolean; otherwise it
+            is a matrix, `(*batch, N, N)`.
     """
 
     data: HankelData
     weights: Weights
+    is_diagonal: bool
+
+    #: What `Adjoint` reads besides: D1 does not move with a derivative, because there is no second one.
+    sets = None
+
+    @property
+    def tails(self) -> tuple[int, ...]:
+        """How many dimensions of D1 are its own."""
+        return (1,) if self.is_diagonal else (2,)
+
+    def check_second_derivative(self) -> None:
+        """Raise NotImplementedError."""
+        raise NotImplementedError('backward="full" gives first derivatives; use backward="reduced" for higher ones.')
 
     @cached_property
     def _form(self) -> CompactForm:
@@ -69,34 +89,44 @@ class FullSystem:
         zero = torch.zeros(sum(sizes.theta), dtype=torch.float64, device=self.weights.Q.device)
         return compact_form(self.data, self.weights, zero)
 
-    def adjoint(self, v_bar: Tensor, lam_bar: Tensor | None, active: Tensor) -> Tensor:
-        """Return theta_bar `(B, n_theta)` for cotangents of v = (u, y) and lam and the rows held at a bound, `(B, N)`.
+    def adjoint(self, v_bar: Tensor | None, lam_bar: Tensor | None, G: Tensor, D: list[Tensor]) -> Tensor:
+        """Return theta_bar and the first N entries of nu side by side, `(*batch, n_theta + N)`.
 
-        With J' nu = (z_bar, w_bar), theta_bar = -K' nu.
+        With J' nu = (z_bar, w_bar), theta_bar = -K' nu, and a parameter s of the set has s_bar = (dP/ds)' nu.
+
+        Args:
+            v_bar, lam_bar: cotangents of v = (u, y) and lam, `(*batch, N)`; None for zero.
+            G: not used.
+            D: D1 as one tensor.
         """
-        if lam_bar is None:
-            lam_bar = torch.zeros_like(v_bar)
-        theta_bar = v_bar.new_empty(len(v_bar), sum(Sizes.of(self.data).theta))
-        for i, sample in enumerate(zip(v_bar, lam_bar, active, strict=True)):
-            theta_bar[i] = self._one(*sample)
-        return theta_bar
+        (D1,) = D
+        like = v_bar if v_bar is not None else lam_bar
+        assert like is not None
+        v_bar, lam_bar = (torch.zeros_like(like) if bar is None else bar for bar in (v_bar, lam_bar))
+        tail = self.tails[0]
+        batch = torch.broadcast_shapes(v_bar.shape[:-1], lam_bar.shape[:-1], D1.shape[: D1.ndim - tail])
+        flat = [bar.expand(*batch, -1).reshape(-1, bar.shape[-1]) for bar in (v_bar, lam_bar)]
+        D1 = D1.expand(*batch, *D1.shape[D1.ndim - tail :]).reshape(-1, *D1.shape[D1.ndim - tail :])
+        out = v_bar.new_empty(len(flat[0]), sum(Sizes.of(self.data).theta) + v_bar.shape[-1])
+        for i, sample in enumerate(zip(*flat, D1, strict=True)):
+            out[i] = self._one(*sample)
+        return out.reshape(*batch, out.shape[-1])
 
-    def _one(self, v_bar: Tensor, lam_bar: Tensor, active: Tensor) -> Tensor:
+    def _one(self, v_bar: Tensor, lam_bar: Tensor, D1: Tensor) -> Tensor:
         P, _, H, _ = self._form
         sizes, n_v = Sizes.of(self.data), len(v_bar)
-        free = torch.ones(len(P), dtype=P.dtype, device=P.device)
-        free[:n_v][active] = 0.0
+        D1 = (~D1).to(P) if self.is_diagonal else D1
         # lam = w_v - blkdiag(R, Q) (v - ref): its cotangent reaches z, w and, at the end, the references.
         weighted = P[:n_v, :n_v] @ lam_bar
         bar = v_bar.new_zeros(len(P) + len(H))
         bar[:n_v] = v_bar - weighted
         bar[-n_v:] = lam_bar
-        nu = _scaled_least_squares(jacobian(P, H, free).T, bar)
-        of_q, of_b = -free * nu[: len(P)], nu[len(P) :]
+        nu = _scaled_least_squares(jacobian(P, H, D1).T, bar)
+        of_q, of_b = -_apply(D1 if self.is_diagonal else D1.T, nu[: len(P), None])[:, 0], nu[len(P) :]
         Yp = self.data.Yp.detach().to(nu)
         refs = -P[:n_v, :n_v] @ of_q[:n_v] + weighted
         y_ini = -2 * self.weights.lambda_s * (Yp @ of_q[n_v:])
-        return torch.cat([of_b[: sizes.u_ini], y_ini, refs])
+        return torch.cat([of_b[: sizes.u_ini], y_ini, refs, nu[:n_v]])
 
 
 def _scaled_least_squares(matrix: Tensor, rhs: Tensor) -> Tensor:
@@ -114,27 +144,3 @@ def _scaled_least_squares(matrix: Tensor, rhs: Tensor) -> Tensor:
 def _root_norm(matrix: Tensor, dim: int) -> Tensor:
     norm = torch.linalg.vector_norm(matrix, dim=dim)
     return torch.where(norm > 0, norm, 1.0).sqrt()
-
-
-class FullAdjoint(torch.autograd.Function):
-    """(v_bar, lam_bar, active, system) -> theta_bar, once."""
-
-    @staticmethod
-    def forward(v_bar: Tensor, lam_bar: Tensor | None, active: Tensor, system: FullSystem) -> Tensor:
-        batch, _, (rows, *bars) = flatten_batch((), (active, v_bar, lam_bar))
-        theta_bar = system.adjoint(bars[0], bars[1], rows)
-        return theta_bar.reshape(*batch, theta_bar.shape[-1])
-
-    @staticmethod
-    def setup_context(ctx: Any, inputs: tuple[Any, ...], output: Tensor) -> None:
-        pass
-
-    @staticmethod
-    def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[Tensor, int]:
-        v_bar, lam_bar, active, system = args
-        lifted = lead_all((v_bar, lam_bar, active), in_dims[:3], (1, 1, 1), info.batch_size)
-        return FullAdjoint.apply(*lifted, system), 0
-
-    @staticmethod
-    def backward(ctx: Any, *_: Tensor) -> Tensor:
-        raise NotImplementedError('backward="full" gives first derivatives; use backward="reduced" for higher ones.')

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 from ..autodiff import is_mapped, is_plain
 from ..checks import one_batch
 from .base import ConvexSet, Part
+from .bounds import Bounds
 from .box import Box, SoftBox
 from .product import Product
 
@@ -123,12 +124,46 @@ class FeasibleSet:
         return all(_is_box(owner) for owner, _ in self.parts)
 
     @property
+    def structure_key(self) -> FeasibleSet | None:
+        """What the factors of a problem depend on: nothing for a box, whose bounds are read at every call."""
+        return None if self.is_box else self
+
+    @property
+    def sources(self) -> tuple[Tensor | float, ...] | None:
+        """What the bounds of a box are made of; None if the sets are no box, whose parameters may be anything."""
+        if not self.is_box:
+            return None
+        return tuple(bound for owner, _ in self.parts for bound in (owner.lower, owner.upper))  # type: ignore[misc]
+
+    def check_engine(self, solver: str) -> None:
+        """Raise ValueError if the forward engine of that name cannot solve for these sets."""
+        if solver == "daqp" and not self.is_box:
+            raise ValueError('`solver="daqp"` is for sets that are boxes; use "newton" or "auto".')
+
+    def for_solve(self, device: torch.device) -> Bounds | FeasibleSet:
+        """Return the sets as a solve takes them: the bounds of a box, or a snapshot with the present parameters.
+
+        Raises:
+            ValueError: parameters, as they are now, that do not describe a set.
+        """
+        if self.is_box:
+            return Bounds(*self.bounds(device))
+        self.check_values()
+        return self.snapshot()
+
+    @property
     def is_piecewise_affine(self) -> bool:
         """Whether the projection certainly is: its Jacobian then has no derivative."""
         return all(_is_box(owner) or type(owner) is SoftBox for owner, _ in self.parts)
 
     def bounds(self, device: torch.device) -> tuple[Tensor, Tensor]:
-        """Return lower and upper of v where the sets are a box, `(..., N)` each, float64, with their graph."""
+        """Return lower and upper of v, `(..., N)` each, float64, with their graph.
+
+        Raises:
+            ValueError: a set is no box.
+        """
+        if not self.is_box:
+            raise ValueError("the sets of this layer are not all boxes: they have no bounds.")
         like = torch.empty(0, dtype=torch.float64, device=device)
         sides: tuple[list[Tensor], list[Tensor]] = ([], [])
         shapes: list[tuple[str, torch.Size]] = []
@@ -231,10 +266,9 @@ class FeasibleSet:
             count = count + (near & (free if slack.shape == free.shape else free[..., :1])).sum((-2, -1))
         return count
 
-    def support(self, d: Tensor) -> Tensor:
-        """Return the supremum over the sets of <d, v>, `(...)`."""
-        each = [owner.support(self._group(d, at, shape)).sum(-1) for owner, at, shape in self._slices]
-        return torch.stack(each).sum(0)
+    def supports(self, d: Tensor) -> Tensor:
+        """Return the supremum of <d, v> over each group's set, `(..., groups of all parts)`; it may be infinite."""
+        return _joined([owner.support(self._group(d, at, shape)) for owner, at, shape in self._slices])
 
     def bounded_direction(self, d: Tensor) -> Tensor:
         """Return a direction near d in which the sets are bounded."""
@@ -249,6 +283,11 @@ class FeasibleSet:
             group = self._group(x, at, shape)
             out.append(_flat(D * group if owner.separable else (D @ group[..., None])[..., 0]))
         return _joined(out)
+
+    def dense(self, blocks: Blocks) -> Tensor:
+        """Return D1 as a matrix, `(..., N, N)`."""
+        eye = torch.eye(len(self.order), dtype=blocks[0].dtype, device=blocks[0].device)
+        return eye - self.complement_times(blocks, eye)
 
     def outer(self, x: Tensor, y: Tensor, blocks: Blocks) -> Blocks:
         """Return the entries of x y' where D1 has entries, summed to the shapes of `blocks`."""
@@ -300,13 +339,13 @@ class FeasibleSet:
         return x[..., at].reshape(*x.shape[:-1], *shape)
 
 
-def outline(owner: ConvexSet) -> Any:
-    """Return what the parts of a set hang on, to compare by `==`: the sets within, their `per` and their channels."""
+def identity_key(owner: ConvexSet) -> tuple[Any, ...]:
+    """Return what the parts of a set depend on, to compare by `==`: the sets within, their `per` and channels."""
     held = owner.__dict__
     if not held["_modules"]:
         return owner, held.get("per")
     channels = [list(own) for own in owner.channels] if isinstance(owner, Product) else None
-    return owner, held.get("per"), channels, [outline(inner) for inner in owner.children()]  # type: ignore[arg-type]
+    return owner, held.get("per"), channels, [identity_key(inner) for inner in owner.children()]  # type: ignore[arg-type]
 
 
 def _is_box(owner: ConvexSet) -> bool:

@@ -15,14 +15,13 @@ Either start is nearly right, so one or two steps finish.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import torch
 from torch import Tensor
 
 from . import kernels
 from .active_set import solve_active
 from .kernels import HYSTERESIS
+from .outcome import Found
 
 #: Steps after which a sample is left to the second engine; converging samples need 2 to 7.
 MAX_STEPS = 20
@@ -32,16 +31,7 @@ NEAR = 0.2
 GRADIENT_STEPS = 15
 
 
-@dataclass
-class ActiveSetResult:
-    """What an engine found, per sample: multipliers lam `(B, N)`, steps `(B,)`, and whether it converged `(B,)`."""
-
-    lam: Tensor
-    iterations: Tensor
-    converged: Tensor
-
-
-def solve_newton(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> ActiveSetResult:
+def solve_newton(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> Found:
     """Solve the reduced problem of every sample.
 
     Args:
@@ -51,19 +41,19 @@ def solve_newton(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor
     """
     if kernels.serve(v0):
         return _by_kernel(G, v0, lower, upper)
-    return _together(G, Ct, v0, lower, upper)
+    return _batched(G, Ct, v0, lower, upper)
 
 
-def _by_kernel(G: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> ActiveSetResult:
+def _by_kernel(G: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> Found:
     if lower.ndim != upper.ndim:
         lower, upper = lower.expand_as(v0), upper.expand_as(v0)
     G_array, centre, low, high = (kernels.as_array(x) for x in (G, v0, lower, upper))
     found = kernels.solve_boxes(G_array, centre, low, high, torch.get_num_threads())
-    return ActiveSetResult(*map(torch.from_numpy, found))
+    return Found(*map(torch.from_numpy, found))
 
 
-def _together(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> ActiveSetResult:
-    result = ActiveSetResult(
+def _batched(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> Found:
+    result = Found(
         lam=torch.zeros_like(v0),
         iterations=torch.zeros(len(v0), dtype=torch.int64, device=v0.device),
         converged=torch.zeros(len(v0), dtype=torch.bool, device=v0.device),
@@ -107,7 +97,7 @@ def _iterate(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) ->
     above = torch.where(tight, -torch.inf, upper + HYSTERESIS * (1 + upper.abs()))
     below = lower - HYSTERESIS * (1 + lower.abs())
     todo: Tensor | slice = slice(None)
-    lam = _foresee(G, v0, lower, upper)
+    lam = _warm_start(G, v0, lower, upper)
     pushed = v0 - _times(lam, G) + lam
     active = (pushed > above) | (pushed < below)
     for step in range(1, MAX_STEPS + 1):
@@ -129,7 +119,7 @@ def _iterate(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) ->
     return lam_out, steps, converged
 
 
-def _foresee(G: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
+def _warm_start(G: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
     """Return rough multipliers: Nesterov's method with step 1/|G|, on multipliers in units of that step."""
     G, v0, lower, upper = (x.float() for x in (G, v0, lower, upper))
     size = G.abs().sum(-1).amax(-1)  # a norm that bounds the largest eigenvalue

@@ -22,10 +22,7 @@ import torch
 
 from ..problem.reduction import Reduction
 from ..problem.rows import Tracking
-
-#: A row is weakly active where its distance to the bound, and the displacement G_ii lam_i that its multiplier makes,
-#: are both at most this, relative to 1 + |bound|. Such a row counts as inactive in every derivative.
-WEAKLY_ACTIVE = 1e-9
+from .weakness import is_without_multiplier, reach_of
 
 #: Where every term of the stationarity of g vanishes at the optimum (the plan meets its reference), what is left is the
 #: rounding of R (u - u_ref) and Q (y - y_ref): this fraction of |C| |(R, Q)| (|v| + |v_ref|) counts as a term too.
@@ -143,11 +140,11 @@ class Optimality:
         raw = _times(self._C, a)
         v = self._clip(raw + lam, lower, upper)  # at a solution this is raw, and a row that lam holds is on its bound
         residual = self.residual(theta, a, a0, raw, v, v0, lam)
-        reach = WEAKLY_ACTIVE * (1 + abs(v))
+        reach = reach_of(v)
         # A difference to an infinite bound is infinite, and so never within reach.
         touching = (upper - v <= reach) | (v - lower <= reach)
         tight = lower == upper  # its projection is constant, whatever the multiplier
-        active = touching & ((abs(lam * self._diagonal) > reach) | tight)
+        active = touching & (~is_without_multiplier(v, lam, self._diagonal) | tight)
         n_active = self._count(active)
         return Judged(v, residual, active, n_active, self._count(touching) - n_active)
 

@@ -1,70 +1,34 @@
-"""The forward solve: choose an engine, judge each sample by the paper's own optimality map, name what failed."""
+"""The forward solve of any problem.
+
+Choose an engine, judge every sample by the paper's F, try the second engine where the first one failed, and look for a
+certificate of infeasibility where both did.
+"""
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from ..batching import flatten_batch, times
-from ..checks import as_data, is_finite
-from ..errors import InfeasibleError, SolveError, Status
+from ..errors import Status
 from ..problem.projected_kkt import FullSystem
 from ..problem.reduction import Reduction
 from ..problem.terms import Sizes
-from . import kernels
-from .active_set import solve_active
-from .dual_active_set import SOLVED_FLAG, Daqp, sense_of, solve_daqp
-from .infeasibility import infeasibility_certificate
-from .newton import ActiveSetResult, solve_newton
-from .optimality import BATCHED, SINGLE, Optimality
+from ..sets.bounds import Bounds
+from ..sets.feasible import Blocks, FeasibleSet
+from .certificate import is_infeasible
+from .engines import Engines, Sets
+from .optimality import BATCHED, Optimality
+from .outcome import ACCEPTANCE, Planned, Solved, check_finite, joined, report_failures
+from .single import SingleSolver
+from .weakness import WEAKLY_ACTIVE, is_without_multiplier
 
-#: A sample is accepted when F, relative to its own terms, is at most this.
-ACCEPTED = 1e-8
-#: One sample's multipliers are taken as they are up to this residual; above it the batched way has its turn.
-AS_GOOD_AS_POLISHED = 1e-11
-#: Up to this many samples on the CPU, NumPy takes one after the other.
-FEW = 3
-#: Without the compiled kernels, DAQP takes batches up to this size on the CPU and Newton larger ones.
-DAQP_BATCH = 16
-
-Engine = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor], ActiveSetResult]
-
-
-class Solved(NamedTuple):
-    """The solution of a batch of reduced problems.
-
-    Attributes:
-        v: the constrained rows (u, y), within their bounds, `(B, N)`; NaN where there is no solution.
-        lam: their multipliers, `(B, N)`; zero where there is no solution.
-        active: the rows that count as active in derivatives, `(B, N)`, boolean.
-        info: status, iterations, residual, n_active, n_weakly_active of each sample, `(B, 5)`.
-    """
-
-    v: Tensor
-    lam: Tensor
-    active: Tensor
-    info: Tensor
-
-    @property
-    def failed(self) -> Tensor:
-        """Which samples have no accepted solution, `(B,)`."""
-        return self.info[..., 0] != Status.SOLVED
-
-
-class Planned(NamedTuple):
-    """The solution as the layer hands it out: `Solved`, with u `(*batch, horizon, n_u)` and y for v."""
-
-    u: Tensor
-    y: Tensor
-    lam: Tensor
-    active: Tensor
-    info: Tensor
+#: Eigenvalues of D below this hold their direction: it counts as active.
+HELD = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,200 +37,161 @@ class Solver:
 
     Attributes:
         reduction: the reduced problem, without a graph.
-        sizes: the parts of theta.
+        sizes: the parts of theta and of v.
+        structure: the sets, which parts they have and of which rows; None for boxes. Parameters are given to `solve`.
         engine: "auto", "newton" or "daqp".
-        on_failure: "raise" or "nan".
-        full: the paper's full system, where the backward is to solve that one.
+        full: the paper's full system, if derivatives are to come from that.
     """
 
     reduction: Reduction
     sizes: Sizes
+    structure: FeasibleSet | None
     engine: str
-    on_failure: str
     full: FullSystem | None = None
 
     @cached_property
-    def _batched(self) -> Optimality:
+    def engines(self) -> Engines:
+        """The engines of this problem."""
+        return Engines(self.reduction, self.structure)
+
+    @cached_property
+    def single(self) -> SingleSolver | None:
+        """The fast path of single samples; None if there is none for this problem."""
+        return SingleSolver.of(self.reduction, self.sizes, self.engines)
+
+    @cached_property
+    def optimality(self) -> Optimality:
+        """The paper's F, for batches."""
         return Optimality(self.reduction, BATCHED)
 
-    @cached_property
-    def _single(self) -> Optimality:
-        return Optimality(self.reduction, SINGLE)
-
-    @cached_property
-    def arrays(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """A_theta, C and G of one problem on the CPU."""
-        return self.reduction.A_theta.numpy(), self.reduction.rows.C.numpy(), self.reduction.G.contiguous().numpy()
-
-    @cached_property
-    def _daqp(self) -> Daqp | None:
-        return Daqp(self.reduction.Ct) if self.reduction.Ct.ndim == 2 else None
-
-    def with_failures(self, on_failure: str) -> Solver:
-        """Return the same solver, its prepared parts included, with another `on_failure`."""
-        other = replace(self, on_failure=on_failure)
-        other.__dict__.update({k: v for k, v in self.__dict__.items() if k not in ("on_failure",)})
-        return other
-
-    def solve(self, theta: Tensor, lower: Tensor, upper: Tensor) -> Planned:
-        """Solve for every theta.
+    def solve(self, theta: Tensor, sets: Sets, on_failure: str) -> Planned:
+        """Solve for every theta, without a graph.
 
         Args:
             theta: (u_ini, y_ini, u_ref, y_ref), `(*batch, n_theta)`, float64.
-            lower, upper: bounds `(N,)` or `(*batch, N)`.
+            sets: with present parameters, without a graph.
+            on_failure: "raise" or "nan".
 
         Raises:
             ValueError: values that are not finite.
             InfeasibleError, SolveError: with `on_failure="raise"`, if a sample has no accepted solution.
         """
-        daqp_first = self._is_daqp_first(theta)
-        if theta.numel() <= FEW * theta.shape[-1]:
-            quick = self._one_by_one(theta, lower, upper, daqp_first)
-            if quick is not None:
-                return quick
-        shared_bounds = lower.ndim == upper.ndim == 1
-        vectors = (theta,) if shared_bounds else (theta, lower, upper)
+        if self.single is not None and isinstance(sets, Bounds):
+            planned = self.single.solve(theta, sets, self.engine)
+            if planned is not None:
+                return planned
+        check_finite(theta, self.sizes)
+        solved = self._solve_flat(theta, sets)
+        report_failures(solved.info, on_failure)
+        planned = Planned(*self.sizes.split(solved.v), solved.lam, solved.active, solved.info)
+        if sets.is_box:
+            return planned
+        return planned._replace(du=solved.v[..., self.sizes.u + self.sizes.y :], weak=solved.weak)
+
+    def jacobian(self, planned: Planned, sets: Sets) -> Blocks:
+        """Return D, the Jacobian of the projection at a solution, as :class:`ProjectedSystem` takes it."""
+        if isinstance(sets, Bounds):
+            return [planned.active]
+        assert planned.weak is not None
+        v = joined(self.sizes, planned.u, planned.y, planned.du, planned.lam)
+        v, lam, weak = (x[..., self.engines.order] for x in (torch.nan_to_num(v), planned.lam, planned.weak))
+        return sets.freed(sets.jacobians(v + self.engines.gamma * lam, self.engines.gamma), weak)
+
+    def independent(self, planned: Planned, sets: Sets) -> Tensor:
+        """Return whether the directions that the sets hold are independent, `(*batch,)`."""
+        G, lam = self.reduction.G, planned.lam
+        if self.structure is not None:
+            G, lam = self.engines.G_in_parts, lam[..., self.engines.order]
+        return self.engines.system.is_regular(G, self.jacobian(planned, sets), lam)
+
+    def _solve_flat(self, theta: Tensor, sets: Sets) -> Solved:
+        """Solve samples with one batch dimension; with those of the sets if their parameters have any."""
+        if isinstance(sets, FeasibleSet) and sets.batch_shape:
+            batch = torch.broadcast_shapes(theta.shape[:-1], sets.batch_shape, self.reduction.V.shape[:-2])
+            return self._solve_all(theta.expand(*batch, theta.shape[-1]), sets)
+        vectors = (theta, *sets.tensors) if isinstance(sets, Bounds) and not sets.are_shared else (theta,)
         batch, _, (samples, *bounds) = flatten_batch((self.reduction.G,), vectors)
-        check_finite(samples, self.sizes)
-        lower, upper = bounds if bounds else (lower, upper)
-        one_each = self if self.reduction.G.ndim == 2 else replace(self, reduction=self.reduction.of_batch(batch))
-        solved = one_each._solve(samples, lower, upper, daqp_first)
-        report_failures(solved.info, batch, self.on_failure)
-        v, *rest = (x.reshape(*batch, x.shape[-1]) for x in solved)
-        return Planned(*self.sizes.split(v), *rest)
+        sets = sets.with_tensors(bounds) if bounds else sets
+        shared = self.reduction.G.ndim == 2
+        solver = self if shared else replace(self, reduction=self.reduction.of_batch(batch))
+        solved = solver._solve_all(samples, sets)
+        return solved.map(lambda x: x.reshape(*batch, x.shape[-1]))
 
-    def independent(self, theta: Tensor, planned: Planned) -> Tensor:
-        """Return whether the rows held at a bound are independent, `(*batch,)`."""
-        batch, _, (active,) = flatten_batch((self.reduction.G,), (planned.active,))
-        one_each = self.reduction.of_batch(batch)
-        return solve_active(one_each.G, one_each.Ct, active, torch.zeros_like(active, dtype=torch.float64))[1].reshape(
-            batch
-        )
-
-    def _solve(self, theta: Tensor, lower: Tensor, upper: Tensor, daqp_first: bool) -> Solved:
-        """Run the first engine on the batch, the second on what it left."""
-        solved = self._attempt(self._engine(daqp_first), theta, lower, upper)
-        failed = solved.failed
-        if bool(failed.any()):
-            rest = failed.nonzero()[:, 0]
-            problem = (theta[rest], _take(lower, rest), _take(upper, rest))
-            subset = replace(self, reduction=self.reduction.of_samples(rest))
-            retried = subset._attempt(subset._engine(not daqp_first), *problem)
-            for whole, part in zip(solved, retried, strict=True):
-                whole[rest] = part
-            subset._mark_failures(solved, rest, *problem)
+    def _solve_all(self, theta: Tensor, sets: Sets) -> Solved:
+        """Run the first engine on all samples, the next one on those that it left."""
+        a0, v0 = self.optimality.unconstrained(theta)
+        first, *others = self.engines.in_order(self.engine, v0, sets)
+        solved, gap = self._attempt(first, theta, a0, v0, sets)
+        for name in others:
+            rest = solved.failed.nonzero()[:, 0]
+            if len(rest) == 0:
+                return solved
+            assert isinstance(sets, Bounds)
+            retried, _ = self._of_samples(rest)._attempt(name, theta[rest], a0[rest], v0[rest], sets.of_samples(rest))
+            solved.put(rest, retried)
+        if bool(solved.failed.any()):
+            self._mark_failures(solved, theta, v0, gap, sets)
         return solved
 
-    def _is_daqp_first(self, theta: Tensor) -> bool:
-        """Newton is faster, but without its kernel for a few problems with one matrix."""
-        if self.engine != "auto":
-            return self.engine == "daqp"
-        few = theta.device.type == "cpu" and theta.numel() <= DAQP_BATCH * theta.shape[-1]
-        return few and self._daqp is not None and not kernels.serve(theta)
+    def _of_samples(self, samples: Tensor) -> Solver:
+        """Return the solver of some samples of a flattened batch; itself if all samples share one problem."""
+        shared = self.reduction.G.ndim == 2
+        return self if shared else replace(self, reduction=self.reduction.of_samples(samples))
 
-    def _engine(self, daqp: bool) -> Engine:
-        return partial(solve_daqp, workspace=self._daqp) if daqp else solve_newton
+    def _attempt(self, engine: str, theta: Tensor, a0: Tensor, v0: Tensor, sets: Sets) -> tuple[Solved, Tensor | None]:
+        """Run one engine and judge what it found; return the gap that it saw as well."""
+        found = self.engines.run(engine, v0, sets)
+        judge = self._judge_box if isinstance(sets, Bounds) else self._judge_sets
+        v, residual, active, weak, counts = judge(theta, a0, v0, found.lam, sets)  # type: ignore[arg-type]
+        failed = ~(found.converged & (residual <= ACCEPTANCE.residual)) | self.reduction.rows.unreachable(theta)
+        columns = failed * Status.FAILED, found.iterations, residual, *counts
+        info = torch.stack([x.double() for x in columns], dim=-1)
+        return Solved(v, found.lam, active, info, weak), found.gap
 
-    def _attempt(self, engine: Engine, theta: Tensor, lower: Tensor, upper: Tensor) -> Solved:
-        """Run one engine on the batch and judge what it found."""
-        a0, v0 = self._batched.unconstrained(theta)
-        found = engine(self.reduction.G, self.reduction.Ct, v0, lower, upper)
-        judged = self._batched.judge(theta, a0, v0, found.lam, lower, upper)
-        failed = ~(found.converged & (judged.residual <= ACCEPTED)) | self.reduction.rows.unreachable(theta)
-        info = [failed * Status.FAILED, found.iterations, judged.residual, judged.n_active, judged.n_weakly_active]
-        return Solved(judged.v, found.lam, judged.active, torch.stack([i.double() for i in info], dim=-1))
+    def _judge_box(self, theta: Tensor, a0: Tensor, v0: Tensor, lam: Tensor, sets: Bounds) -> _Judged:
+        v, residual, active, n_active, n_weakly_active = self.optimality.judge(theta, a0, v0, lam, *sets.tensors)
+        return _Judged(v, residual, active, None, (n_active, n_weakly_active))
 
-    def _one_by_one(self, theta: Tensor, lower: Tensor, upper: Tensor, daqp_first: bool) -> Planned | None:
-        """Solve and judge the samples in NumPy; None where that does not do, or one of them does not convince.
+    def _judge_sets(self, theta: Tensor, a0: Tensor, v0: Tensor, lam: Tensor, sets: FeasibleSet) -> _Judged:
+        """Judge by F with the projection onto the sets; count the directions that D holds, block by block."""
+        order, inverse, gamma = self.engines.order, self.engines.inverse, self.engines.gamma
+        a = a0 - times(self.reduction.A_lam, lam)
+        raw = times(self.reduction.rows.C, a)
+        lam_in_parts = lam[..., order]
+        v = sets.prox(raw[..., order] + lam_in_parts)
+        residual = self.optimality.residual(theta, a, a0, raw, v[..., inverse], v0, lam)
+        diagonal = self.engines.G_in_parts.diagonal(dim1=-2, dim2=-1)
+        weak = sets.weak(v, is_without_multiplier(v, lam_in_parts, diagonal)).expand_as(v)
+        d, _ = sets.spectral(sets.freed(sets.jacobians(v + gamma * lam_in_parts, gamma), weak))
+        active = (d < HELD).expand_as(v)
+        counts = active.sum(-1), sets.touching(v, weak, WEAKLY_ACTIVE).expand(v.shape[:-1])
+        return _Judged(v[..., inverse], residual, active[..., inverse], weak[..., inverse], counts)
 
-        A value that is not finite does not: the engines flag what comes of it, and the batched way says its name.
-        """
-        if theta.device.type != "cpu" or not (daqp_first or kernels.serve(theta)):
-            return None
-        plain = lower.ndim == upper.ndim == 1 and self.reduction.G.ndim == 2 and self.reduction.rows.Eq_range is None
-        batch, sample = theta.shape[:-1], theta.numpy()
-        if not plain:
-            return None
-        bounds = lower.numpy(), upper.numpy()
-        if not batch:
-            one = self._one(sample, *bounds, daqp_first)
-            if one is None:
-                return None
-            v, *rest = one
-        else:
-            several = [self._one(row, *bounds, daqp_first) for row in sample.reshape(-1, sample.shape[-1])]
-            found = [one for one in several if one is not None]
-            if not found or len(found) < len(several):
-                return None
-            v, *rest = (np.stack(x).reshape((*batch, -1)) for x in zip(*found, strict=True))
-        return Planned(*map(torch.from_numpy, (*self.sizes.split(v), *rest)))
-
-    def _one(
-        self, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray, daqp_first: bool
-    ) -> tuple[np.ndarray, ...] | None:
-        """Return v, lam, active and info of one sample, as `Solved` describes them; None if they do not convince."""
-        a0, v0 = self._single.unconstrained(theta)
-        if daqp_first and self._daqp is not None:
-            lam, flag, iterations = self._daqp.solve(lower - v0, upper - v0, sense_of(lower == upper))
-            solved = flag == SOLVED_FLAG
-        else:
-            (lam,), (iterations,), (solved,) = kernels.solve_boxes(self.arrays[2], v0[None], lower, upper)
-        v, residual, active, n_active, n_weak = self._single.judge(theta, a0, v0, lam, lower, upper)
-        if not (solved and residual <= AS_GOOD_AS_POLISHED):  # NaN is not either
-            return None
-        return v, lam, active, np.array((Status.SOLVED, iterations, residual, n_active, n_weak), dtype=np.float64)
-
-    def _mark_failures(self, solved: Solved, rest: Tensor, theta: Tensor, lower: Tensor, upper: Tensor) -> None:
-        """Look for certificates where both engines failed; leave NaN for v and nothing in the multipliers."""
+    def _mark_failures(self, solved: Solved, theta: Tensor, v0: Tensor, gap: Tensor | None, sets: Sets) -> None:
+        """Look for certificates; leave NaN for v and nothing else of a sample without a solution."""
+        failed = solved.failed
         Ct, unreachable = self.reduction.Ct, self.reduction.rows.unreachable(theta)
-        v0 = times(self.reduction.V, theta)
-        for k, i in enumerate(rest.tolist()):
-            if solved.info[i, 0] == Status.SOLVED:
-                continue
-            sample = (Ct if Ct.ndim == 2 else Ct[k], v0[k], _row(lower, k), _row(upper, k))
-            if bool(unreachable[k]) or infeasibility_certificate(*sample):
-                solved.info[i, 0] = Status.INFEASIBLE
-            solved.v[i] = torch.nan
-            for emptied in (solved.lam[i], solved.active[i], solved.info[i, 3:]):
-                emptied.zero_()
+        if isinstance(sets, Bounds):
+            rest = failed.nonzero()[:, 0]
+            proven = torch.zeros_like(failed)
+            proven[rest] = is_infeasible(Ct if Ct.ndim == 2 else Ct[rest], v0[rest], sets.of_samples(rest), None)
+        else:
+            order = self.engines.order
+            proven = is_infeasible(Ct[..., order, :], v0[..., order], sets, None if gap is None else gap[..., order])
+        status = torch.where(proven | unreachable, float(Status.INFEASIBLE), float(Status.FAILED))
+        solved.info[..., 0] = torch.where(failed, status, solved.info[..., 0])
+        solved.v[failed] = torch.nan
+        for emptied in (solved.lam, solved.active, solved.info[..., 3:]):
+            emptied[failed] = 0
+        if solved.weak is not None:
+            solved.weak[failed] = True
 
 
-def check_finite(theta: Tensor, sizes: Sizes) -> None:
-    """Raise ValueError, naming the part of theta that holds it, at a value that is not finite."""
-    if is_finite(theta):
-        return
-    for name, part in zip(("u_ini", "y_ini", "u_ref", "y_ref"), theta.split(sizes.theta, dim=-1), strict=True):
-        as_data(name, part)
+class _Judged(NamedTuple):
+    """What the conditions say of a batch: v, residual, active and weak rows, n_active and n_weakly_active."""
 
-
-def report_failures(info: Tensor, batch: torch.Size, on_failure: str) -> None:
-    """Raise what the samples without a solution call for, given the info table `(B, 5)`."""
-    failed = (info[:, 0] != Status.SOLVED).nonzero()[:, 0]
-    if on_failure == "nan" or len(failed) == 0:
-        return
-    infeasible = (info[failed, 0] == Status.INFEASIBLE).tolist()
-    places = [tuple(int(j) for j in torch.unravel_index(i, batch)) if batch else () for i in failed]
-    where = f"batch {'index' if len(places) == 1 else 'indices'} {_listed(places)}" if batch else "the problem"
-    hint = 'on_failure="nan" marks such samples and returns the others.'
-    if all(infeasible):
-        why = "no trajectory meets the constraints (the data cannot produce u_ini, or the bounds exclude all)"
-        raise InfeasibleError(f"{where}: {why}. {hint}", places)
-    worst = float(info[failed, 2].max())
-    raise SolveError(
-        f"{where}: no engine reached a residual of {ACCEPTED:g} (got {worst:.1e}), and {sum(infeasible)} of "
-        f"{len(places)} are proven infeasible. Badly scaled data or weights are the usual reason. {hint}",
-        places,
-    )
-
-
-def _listed(places: list[tuple[int, ...]], most: int = 10) -> str:
-    names = [str(p[0]) if len(p) == 1 else str(p) for p in places[:most]]
-    return ", ".join(names) + (f" and {len(places) - most} more" if len(places) > most else "")
-
-
-def _take(bound: Tensor, samples: Tensor) -> Tensor:
-    return bound if bound.ndim == 1 else bound[samples]
-
-
-def _row(bound: Tensor, sample: int) -> Tensor:
-    return bound if bound.ndim == 1 else bound[sample]
+    v: Tensor
+    residual: Tensor
+    active: Tensor
+    weak: Tensor | None
+    counts: tuple[Tensor, Tensor]

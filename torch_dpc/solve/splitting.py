@@ -22,7 +22,7 @@ from torch import Tensor
 
 from ..batching import times
 from ..sets.feasible import FeasibleSet
-from .projected_system import solve_system
+from .projected_system import newton_step
 
 #: Splitting steps before Newton.
 SPLITTING_STEPS = 20
@@ -130,7 +130,7 @@ def _newton(G: Tensor, v0: Tensor, sets: FeasibleSet, gamma: Tensor, lam: Tensor
         todo = size > CONVERGED
         if not bool(todo.any()):
             break
-        step, _ = solve_system(G, sets, sets.jacobians(x, gamma), F, gamma)
+        step = newton_step(G, sets, sets.jacobians(x, gamma), F, gamma)
         iterations = iterations + todo
         length = todo.to(size)
         for _ in range(HALVINGS):

@@ -16,9 +16,8 @@ from ..attacks.gradient import LinearizedAttack
 from ..checks import as_data, check_count
 from ..data.predictor import Predictor
 from ..errors import Status
+from ..factors import Factored
 from ..layer import DPCLayer
-from ..problem.reduction import Reduction
-from ..solve.solver import Solver
 from .outcome import OutputModel, QuadraticCost, RunCost
 from .scales import WeightScales, base_weight, with_weights
 
@@ -182,11 +181,11 @@ class WorstRun:
 class _FactoredOnce(DPCLayer):
     """A layer for one evaluation: its weights never change, so the factors, graph included, are made once."""
 
-    _kept: tuple[Reduction, Solver] | None = None
+    _kept: Factored | None = None
 
-    def _factors(self, device: torch.device) -> tuple[Reduction, Solver]:
+    def _factored(self, device: torch.device) -> Factored:
         if self._kept is None:
-            self._kept = super()._factors(device)
+            self._kept = super()._factored(device)
         return self._kept
 
 

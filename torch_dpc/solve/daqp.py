@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from .active_set import solve_active
-from .newton import ActiveSetResult
+from .outcome import Found
 
 #: DAQP's default, 1e-6, calls slightly infeasible problems solved.
 PRIMAL_TOLERANCE = 1e-10
@@ -71,9 +71,7 @@ def sense_of(tight: np.ndarray) -> np.ndarray:
     return tight * _EQUALITY
 
 
-def solve_daqp(
-    G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor, workspace: Daqp | None = None
-) -> ActiveSetResult:
+def solve_daqp(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor, workspace: Daqp | None = None) -> Found:
     """Solve the samples one after the other; arguments and result are those of `solve_newton`.
 
     Args:
@@ -91,4 +89,4 @@ def solve_daqp(
     rough, *rest = (torch.from_numpy(x).to(v0.device) for x in (found, iterations, solved))
     active = (rough != 0) | (lower == upper)
     lam, _ = solve_active(G, Ct, active, v0 - torch.where(rough > 0, upper, lower))
-    return ActiveSetResult(lam, *rest)
+    return Found(lam, *rest)

@@ -1,0 +1,150 @@
+"""What engines find and what a solve returns; which samples are accepted; how failures are reported."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import torch
+from torch import Tensor
+
+from ..checks import as_data, is_finite
+from ..errors import InfeasibleError, SolveError, Status
+from ..problem.terms import Sizes
+
+
+@dataclass(frozen=True)
+class Acceptance:
+    """Which solutions are accepted.
+
+    Attributes:
+        residual: largest residual F of an accepted sample, relative to the terms of F.
+        residual_of_one: largest residual of the single-sample path; a larger one sends the sample to the batched path.
+    """
+
+    residual: float = 1e-8
+    residual_of_one: float = 1e-11
+
+
+ACCEPTANCE = Acceptance()
+
+
+@dataclass
+class Found:
+    """What an engine found for each sample.
+
+    Attributes:
+        lam: multipliers, `(B, N)`, in the order of v.
+        iterations: steps, `(B,)`, int64.
+        converged: whether the engine reached its own tolerance, `(B,)`, boolean.
+        gap: a guess of the shortest vector from the sets to the trajectories, `(B, N)`, for the certificate of
+            infeasibility; None if the engine has none.
+    """
+
+    lam: Tensor
+    iterations: Tensor
+    converged: Tensor
+    gap: Tensor | None = None
+
+
+class Solved(NamedTuple):
+    """The solution of a batch of reduced problems.
+
+    Attributes:
+        v: the constrained rows (u, y, du), within their sets, `(*batch, N)`; NaN without a solution.
+        lam: their multipliers, `(*batch, N)`; zero without a solution.
+        active: the rows that count as active in derivatives, `(*batch, N)`, boolean.
+        info: status, iterations, residual, n_active, n_weakly_active of each sample, `(*batch, 5)`, float64.
+        weak: the rows whose multiplier counts as zero, `(*batch, N)`, boolean; None for boxes, where `active` says it.
+    """
+
+    v: Tensor
+    lam: Tensor
+    active: Tensor
+    info: Tensor
+    weak: Tensor | None = None
+
+    @property
+    def failed(self) -> Tensor:
+        """Which samples have no accepted solution, `(*batch,)`."""
+        return self.info[..., 0] != Status.SOLVED
+
+    def map(self, change: Callable[[Tensor], Tensor]) -> Solved:
+        """Return the solution with each tensor changed."""
+        weak = None if self.weak is None else change(self.weak)
+        return Solved(change(self.v), change(self.lam), change(self.active), change(self.info), weak)
+
+    def put(self, samples: Tensor, part: Solved) -> None:
+        """Write the solution of some samples in place."""
+        for whole, of_samples in zip(self, part, strict=True):
+            if whole is not None and of_samples is not None:
+                whole[samples] = of_samples
+
+
+class Planned(NamedTuple):
+    """The solution as the autograd Function returns it.
+
+    Attributes:
+        u, y: the plan, `(*batch, horizon, n)`; NaN without a solution.
+        lam, active, info: as in :class:`Solved`.
+        du: the changes of the input, `(*batch, n_du)`, and
+        weak: as in :class:`Solved`; both None for boxes, whose derivative needs neither.
+    """
+
+    u: Tensor
+    y: Tensor
+    lam: Tensor
+    active: Tensor
+    info: Tensor
+    du: Tensor | None = None
+    weak: Tensor | None = None
+
+
+def joined(sizes: Sizes, u: Tensor | None, y: Tensor | None, du: Tensor | None, like: Tensor) -> Tensor:
+    """Return v `(*batch, N)` of its parts u, y `(*batch, horizon, n)` and du `(*batch, n_du)`; zero for None."""
+    v = sizes.join(u, y, like)
+    return v if du is None or not sizes.du else torch.cat([v[..., : sizes.u + sizes.y], du], dim=-1)
+
+
+def check_finite(theta: Tensor, sizes: Sizes) -> None:
+    """Raise ValueError, naming the part of theta, at a value that is not finite."""
+    if is_finite(theta):
+        return
+    for name, part in zip(("u_ini", "y_ini", "u_ref", "y_ref"), theta.split(sizes.theta, dim=-1), strict=True):
+        as_data(name, part)
+
+
+def report_failures(info: Tensor, on_failure: str) -> None:
+    """Raise if a sample failed and `on_failure` is "raise".
+
+    Args:
+        info: as in :class:`Solved`, `(*batch, 5)`.
+        on_failure: "raise" or "nan".
+
+    Raises:
+        InfeasibleError: every failed sample is proven infeasible.
+        SolveError: another failure.
+    """
+    if on_failure == "nan" or not bool((info[..., 0] != Status.SOLVED).any()):
+        return
+    batch, info = info.shape[:-1], info.reshape(-1, info.shape[-1])
+    failed = (info[:, 0] != Status.SOLVED).nonzero()[:, 0]
+    infeasible = (info[failed, 0] == Status.INFEASIBLE).tolist()
+    places = [tuple(int(j) for j in torch.unravel_index(i, batch)) if batch else () for i in failed]
+    where = f"batch {'index' if len(places) == 1 else 'indices'} {_listed(places)}" if batch else "the problem"
+    hint = 'on_failure="nan" marks such samples and returns the others.'
+    if all(infeasible):
+        why = "no trajectory meets the constraints (the data cannot produce u_ini, or the bounds exclude all)"
+        raise InfeasibleError(f"{where}: {why}. {hint}", places)
+    worst = float(info[failed, 2].max())
+    raise SolveError(
+        f"{where}: no engine reached a residual of {ACCEPTANCE.residual:g} (got {worst:.1e}), and {sum(infeasible)} of "
+        f"{len(places)} are proven infeasible. Badly scaled data or weights are the usual reason. {hint}",
+        places,
+    )
+
+
+def _listed(places: list[tuple[int, ...]], most: int = 10) -> str:
+    names = [str(p[0]) if len(p) == 1 else str(p) for p in places[:most]]
+    return ", ".join(names) + (f" and {len(places) - most} more" if len(places) > most else "")
