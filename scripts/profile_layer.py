@@ -82,8 +82,13 @@ def stages_of(layer: dpc.DPCLayer, problems: list[Problem]) -> tuple[Stages, Sta
         assert solver.single is not None
         optimality = solver.single.optimality
     samples, lo, up = [as_array(theta) for theta in thetas], as_array(lower), as_array(upper)
-    starts, lams = [optimality.unconstrained(sample) for sample in samples], [as_array(found.lam) for found in solved]
+    starts: list[tuple[Any, Any]] = [optimality.unconstrained(sample) for sample in samples]
+    lams = [as_array(found.lam) for found in solved]
     G = reduction.G.contiguous().numpy()
+
+    def judge(i: int) -> Any:
+        a0, v0 = starts[i]
+        return optimality.judge(samples[i], a0, v0, lams[i], lo, up)
 
     def find(start: Any) -> Any:
         if one:
@@ -101,7 +106,7 @@ def stages_of(layer: dpc.DPCLayer, problems: list[Problem]) -> tuple[Stages, Sta
     inside = {
         "unconstrained minimiser": lambda i: optimality.unconstrained(samples[i % n]),
         "finding the active set": lambda i: find(starts[i % n]),
-        "judging the solution": lambda i: optimality.judge(samples[i % n], *starts[i % n], lams[i % n], lo, up),
+        "judging the solution": lambda i: judge(i % n),
     }
     backward = {
         "systems on the active rows": lambda i: adjoint(reduction.G, reduction.Ct, *flat[i % n]),

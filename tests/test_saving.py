@@ -286,7 +286,7 @@ def test_a_place_that_cannot_be_written_is_named(tmp_path, where):
 
 
 def test_settings_that_do_not_go_together_are_not_written(tmp_path):
-    layer = small_layer(solver="newton")
+    layer = small_layer(solver="daqp")
     layer.u_set = dpc.Ball(1.0)
     with pytest.raises(ValueError, match="sets that are boxes"):
         layer.save(tmp_path / "layer")
