@@ -1,5 +1,8 @@
 """Differentiable data-driven predictive control for PyTorch, and attacks on it."""
 
+import importlib
+from types import ModuleType
+
 from . import attacks, systems, tuning
 from .attacks import (
     BallBudget,
@@ -65,3 +68,10 @@ __all__ = [
     "systems",
     "tuning",
 ]
+
+
+def __getattr__(name: str) -> ModuleType:
+    """Import `torch_dpc.envs` when it is first used: it needs the extra `gym`."""
+    if name == "envs":
+        return importlib.import_module(f".{name}", __name__)
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
