@@ -1,14 +1,16 @@
 """Layers on disk: safetensors files, which hold tensors and text and run no code when they are read.
 
 The header holds one JSON text: the format's version, the sizes of the data, and the arguments of `DPCLayer` as a tree
-of numbers, strings, lists and sets, in which each tensor stands by its name in the file. By default the data are
-written compact (:meth:`torch_dpc.HankelData.compressed`), so that a file is small whatever the number of windows.
+of numbers, strings, lists and sets, in which each tensor stands by its name in the file, and a checksum of the text and
+of every tensor (files of earlier versions have none). By default the data are written compact
+(:meth:`torch_dpc.HankelData.compressed`), so that a file is small whatever the number of windows.
 
 A set is written as the arguments of its constructor; see :mod:`torch_dpc.sets.registry`.
 """
 
 from __future__ import annotations
 
+import hashlib
 import json
 import math
 import os
@@ -20,8 +22,10 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
+from .checks import as_data
 from .data.hankel import HankelData
 from .data.row_space import RowSpace, row_units
+from .files import write_whole
 from .sets import ConvexSet
 from .sets.registry import arguments_of, known_sets, register_set
 
@@ -31,6 +35,9 @@ __all__ = ["load_layer", "register_set", "save_layer"]
 VERSION = 1
 #: The key of the text in the header.
 HEADER = "torch_dpc"
+#: What the text holds; the checksum is of all the rest.
+CHECKSUM = "sha256"
+ENTRIES = {"version", "data", "arguments", CHECKSUM}
 
 
 def save_layer(layer: nn.Module, path: str | os.PathLike[str], *, data: bool = False) -> None:
@@ -48,12 +55,8 @@ def save_layer(layer: nn.Module, path: str | os.PathLike[str], *, data: bool = F
         "data": _data_to_tree(held if data else held.compressed(), writer),
         "arguments": {name: writer.tree(value, f"`{name}`", name) for name, value in arguments_of(layer).items()},
     }
-    from safetensors import SafetensorError
-
-    try:
-        torch_files.save_file(writer.tensors, path, metadata={HEADER: json.dumps(text, allow_nan=False)})
-    except SafetensorError as error:
-        raise OSError(f"{os.fspath(path)!r} cannot be written: {error}") from error
+    text[CHECKSUM] = _checksum(text, writer.tensors)
+    write_whole(path, torch_files.save(writer.tensors, metadata={HEADER: json.dumps(text, allow_nan=False)}))
 
 
 def load_layer(cls: type[Any], path: str | os.PathLike[str]) -> Any:
@@ -64,11 +67,14 @@ def load_layer(cls: type[Any], path: str | os.PathLike[str]) -> Any:
             f"{os.fspath(path)!r} has version {text.get('version')!r} of the format, this torch_dpc reads version "
             f"{VERSION}: read it with the torch_dpc that wrote it."
         )
+    found = text.pop(CHECKSUM, None)
+    if text.keys() - ENTRIES or (found is not None and found != _checksum(text, tensors)):
+        raise ValueError(f"{os.fspath(path)!r} is damaged: its content does not agree with its checksum.")
     reader = _Reader(tensors)
     try:
         data = _data_from_tree(text["data"], reader)
         return cls(data, **{name: reader.value(tree) for name, tree in text["arguments"].items()})
-    except (KeyError, TypeError, AttributeError) as error:
+    except (KeyError, TypeError, AttributeError, IndexError, RecursionError) as error:
         raise ValueError(f"{os.fspath(path)!r} is not a whole torch_dpc file: {error!r}.") from error
 
 
@@ -91,7 +97,7 @@ def _data_to_tree(data: HankelData, writer: _Writer) -> dict[str, Any]:
 
 def _data_from_tree(tree: Mapping[str, Any], reader: _Reader) -> HankelData:
     numbers = {name: tree[name] for name in _DATA_NUMBERS}
-    matrices = {name: reader.tensors[f"data.{name}"] for name in _MATRICES}
+    matrices = {name: as_data(f"data.{name}", reader.tensors[f"data.{name}"]) for name in _MATRICES}
     columns = matrices["Up"].shape[-1]
     for name, matrix in matrices.items():
         rows = numbers["t_ini" if name[1] == "p" else "horizon"] * numbers["n_u" if name[0] == "U" else "n_y"]
@@ -211,11 +217,20 @@ def _read(path: str | os.PathLike[str]) -> tuple[dict[str, Any], dict[str, Tenso
         raise ValueError(f"{os.fspath(path)!r} is not a whole safetensors file: {error}") from error
     try:
         text = json.loads("null" if header is None else header)
-    except json.JSONDecodeError as error:
+    except (json.JSONDecodeError, RecursionError) as error:
         raise ValueError(f"{os.fspath(path)!r} has a damaged header: {error}.") from error
     if not isinstance(text, dict):
         raise ValueError(f"{os.fspath(path)!r} is a safetensors file, but not one that `DPCLayer.save` wrote.")
     return text, tensors
+
+
+def _checksum(text: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> str:
+    """Return the SHA-256 of the text and of every tensor with its name, precision and shape."""
+    digest = hashlib.sha256(json.dumps(text).encode())
+    for name, tensor in sorted(tensors.items()):
+        digest.update(f"\n{name} {tensor.dtype} {tuple(tensor.shape)}\n".encode())
+        digest.update(tensor.contiguous().reshape(-1).view(torch.uint8).numpy().tobytes())
+    return digest.hexdigest()
 
 
 def _safetensors() -> Any:
