@@ -45,6 +45,17 @@ class Box(ConvexSet):
             lower, upper = (bound.flatten(-2) if bound.ndim > 1 else bound for bound in (lower, upper))
         return lower, upper
 
+    def interval(self, places: Tensor, dtype: torch.dtype) -> tuple[tuple[Tensor, Tensor], None]:
+        """Return lower and upper of rows `(groups, size)`, `(*batch, groups, size)` each, without a graph; no price."""
+        like = torch.empty(0, dtype=dtype, device=places.device)
+        lower, upper = (
+            bound.detach().expand(*bound.shape[:-2], *places.shape)
+            if bound.ndim > 1
+            else bound.detach().expand(places.shape)
+            for bound in self.bounds(like)
+        )
+        return (lower, upper), None
+
     def check(self, name: str, steps: int, channels: int) -> None:
         places = self.parts(steps, channels)[0][1]
         for bound in (self.lower, self.upper):
@@ -180,6 +191,12 @@ class SoftBox(ConvexSet):
         pull = (x - self.box.project(x)).abs()
         held = (pull > 0) & (pull <= gamma * as_tensor(self.weight).to(x))
         return (~held).to(x)
+
+    def interval(self, places: Tensor, dtype: torch.dtype) -> tuple[tuple[Tensor, Tensor], Tensor]:
+        """Return lower, upper and price of rows `(groups, size)`, `(*batch, groups, size)` each, without a graph."""
+        weight = as_tensor(self.weight).detach().to(dtype=dtype, device=places.device)
+        batch = weight.shape[:-2] if weight.ndim > 2 else ()
+        return self.box.interval(places, dtype)[0], weight.expand(*batch, *places.shape)
 
     def minimize_linear(self, c: Tensor) -> Tensor:
         return self.box.minimize_linear(c)

@@ -55,6 +55,13 @@ class Ball(ConvexSet):
         direction = torch.where(at_center, 0.0, away / distance)
         return center, direction, torch.where(at_center, 0.0, distance), as_tensor(self.radius).to(x)[..., None]
 
+    def center_and_radius(self, like: Tensor) -> tuple[Tensor, Tensor]:
+        """Return both for groups of rows shaped like `(groups, size)`: `(*batch, groups, size)`, `(*batch, groups)`."""
+        center, _, _, radius = (part.detach() for part in self._polar(like))
+        batch = radius.shape[:-2] if radius.ndim > 2 else ()
+        center = center.expand(*(center.shape[:-2] if center.ndim > 2 else ()), *like.shape)
+        return center, radius[..., 0].expand(*batch, len(like))
+
     def project(self, x: Tensor) -> Tensor:
         center, direction, distance, radius = self._polar(x)
         return torch.where(distance > radius, center + radius * direction, x)
