@@ -3,7 +3,7 @@
 import importlib
 from types import ModuleType
 
-from . import attacks, systems, tuning
+from . import attacks, plot, systems, tuning
 from .attacks import (
     BallBudget,
     BoxBudget,
@@ -63,6 +63,7 @@ __all__ = [
     "collect",
     "excitation_order",
     "hankel",
+    "plot",
     "register_set",
     "simulate",
     "systems",

@@ -5,10 +5,12 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
+from . import plot
 from .autodiff import carries_derivative
 from .batching import times
 from .data.hankel import HankelData
@@ -18,6 +20,9 @@ from .problem.reduction import Reduction
 from .solve.engines import Sets
 from .solve.outcome import Planned
 from .solve.solver import Solver
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 class SolveInfo:
@@ -92,6 +97,10 @@ class DPCSolution:
     def g(self) -> Tensor:
         """The combination of the recorded windows, `(*batch, n_g)`; computed when first asked for."""
         return self._make_g()
+
+    def plot(self, axes: Any = None, **options: Any) -> Figure:
+        """Draw the plan, with its past and the truth where they are given: :func:`torch_dpc.plot.plan`."""
+        return plot.plan(self, axes, **options)
 
     def sample(self, i: int) -> DPCSolution:
         """Return one sample of a batch."""

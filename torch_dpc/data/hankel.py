@@ -12,17 +12,21 @@ import os
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
+from .. import plot
 from ..checks import check_count
 from .csv import Source, read_csv
 from .rank import excitation_order, has_full_row_rank, relative_tolerance, warn_of_excitation
 from .recordings import as_recordings, hankel
 from .row_space import RowSpace
 from .window_factor import WindowFactor
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 __all__ = ["HankelData", "excitation_order", "hankel"]
 
@@ -266,6 +270,10 @@ class HankelData:
     def rank(self) -> int:
         """The numerical rank of [Up; Yp; Uf; Yf], channels brought to one scale."""
         return self.row_space.rank
+
+    def plot(self, axes: Any = None) -> Figure:
+        """Draw the Hankel matrix, its singular values with the cut, and the excitation: :func:`torch_dpc.plot.data`."""
+        return plot.data(self, axes)
 
     def __repr__(self) -> str:
         space = self.row_space
