@@ -132,11 +132,11 @@ def test_what_does_not_fit_is_named_with_the_class_and_the_step(plant, says):
     [
         ({"steps": 0}, "`steps` must be a positive integer"),
         ({"hold": 0}, "`hold` must be a positive integer"),
-        ({"amplitude": torch.ones(3)}, r"`amplitude` must be a number or have shape \(1,\), got \(3,\)"),
+        ({"amplitude": torch.ones(3)}, r"`amplitude` must be a number or have shape \(\*batch, 1\), got \(3,\)"),
         ({"offset": float("nan")}, "`offset` must be finite"),
         ({"feedback": lambda y: torch.zeros(2)}, r"`feedback\(y\)` must have shape \(\*batch, 1\), got \(2,\)"),
     ],
-    ids=str,
+    ids=lambda v: "" if isinstance(v, str) else next(iter(v)),
 )
 def test_bad_recordings_are_named(change, says):
     with pytest.raises(ValueError, match=says):

@@ -3,6 +3,7 @@
 from .cart_pole import CartPole
 from .four_tanks import FourTanks
 from .gym import GymPlant
+from .many import Many
 from .masses import OscillatingMasses
 from .ode import Ode
 from .quadrotor import Quadrotor
@@ -14,6 +15,7 @@ __all__ = [
     "CartPole",
     "FourTanks",
     "GymPlant",
+    "Many",
     "Ode",
     "OscillatingMasses",
     "Quadrotor",

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping
 from numbers import Real
-from typing import Any, Protocol
+from typing import Any, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -52,6 +52,17 @@ class Plant(Protocol):
 
     def step(self, u: Any) -> Any:
         """Apply u, `(*batch, n_u)`, for one step and return the measurement after it, `(*batch, n_y)`."""
+
+
+@runtime_checkable
+class Resumable(Protocol):
+    """A plant that can go back to where it was; plants in torch can."""
+
+    def snapshot(self) -> tuple[Tensor, ...]:
+        """Return what decides the future together with the inputs to come."""
+
+    def restore(self, snapshot: tuple[Tensor, ...]) -> None:
+        """Continue from a snapshot."""
 
 
 class Port:
@@ -176,15 +187,15 @@ def collect(
 
 
 def per_input(name: str, value: Any, n_u: int) -> Tensor:
-    """Return a number or `(n_u,)` as a tensor `(n_u,)`, float64.
+    """Return a number or `(*batch, n_u)` as a tensor `(*batch, n_u)`, float64.
 
     Raises:
         ValueError: another shape, or values that are not finite.
     """
     tensor = as_data(name, torch.as_tensor(value, dtype=torch.float64))
-    if tensor.shape not in ((), (1,), (n_u,)):
-        raise ValueError(f"`{name}` must be a number or have shape ({n_u},), got {tuple(tensor.shape)}.")
-    return tensor.expand(n_u)
+    if tensor.ndim and tensor.shape[-1] not in (1, n_u):
+        raise ValueError(f"`{name}` must be a number or have shape (*batch, {n_u}), got {tuple(tensor.shape)}.")
+    return tensor.expand(*tensor.shape[:-1], n_u)
 
 
 def _fed_back(value: Any, port: Port) -> Tensor:

@@ -29,7 +29,7 @@ class GroundContactError(RuntimeError):
         self.vehicles = vehicles
         named = "the vehicle" if vehicles.ndim == 0 else f"vehicles {vehicles.nonzero().tolist()[:10]} of the batch"
         super().__init__(
-            f"{named} touched the ground; contact is not modelled. Use `ground=\"stop\"` to leave such vehicles where "
+            f'{named} touched the ground; contact is not modelled. Use `ground="stop"` to leave such vehicles where '
             "they touched, or `Quadrotor` (PyBullet) for what happens afterwards."
         )
 

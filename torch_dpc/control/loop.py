@@ -1,0 +1,111 @@
+"""One step of the closed loop after another."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Any
+
+import torch
+from torch import Tensor
+
+from ..systems.plant import Port
+from .controller import DPCController
+from .past import Past
+
+#: (u_ini, y_ini, *, y_ref, u_ref, generator, step) -> p.
+Attack = Callable[..., Tensor]
+
+
+class Loop:
+    """The plant, the controller, the attack, and the last `t_ini` steps of every run.
+
+    Args:
+        port: the plant.
+        controller: it has been reset.
+        y_refs, u_refs: references, `(*batch, >= steps + horizon, n)`.
+        attack: or None.
+        generator: handed to the attack.
+
+    Attributes:
+        y: the present outputs, `(*batch, n_y)`.
+        p: what was added to y_ini at the plan in force, `(*batch, t_ini, n_y)`.
+    """
+
+    def __init__(
+        self,
+        port: Port,
+        controller: DPCController,
+        y_refs: Tensor,
+        u_refs: Tensor,
+        attack: Attack | None,
+        generator: Any,
+    ):
+        self.port, self.controller, self.attack, self.generator = port, controller, attack, generator
+        self.y_refs, self.u_refs = y_refs, u_refs
+        self.data = controller.layer.data
+        self.past = Past(self.data.t_ini)
+
+    @property
+    def batch(self) -> torch.Size:
+        """Shape of the runs."""
+        return self.y.shape[:-1]
+
+    def warm_up(self, reset: bool | Mapping[str, Any], u: Tensor) -> None:
+        """Start the plant and fill the windows at a constant input, `(*batch, n_u)`."""
+        self.y = self.port.start(reset, u)
+        if u.shape[:-1] not in (torch.Size(()), self.batch):
+            raise ValueError(f"`u_warmup` has the runs {tuple(u.shape[:-1])} in front, the plant {tuple(self.batch)}.")
+        u = u.expand(*self.batch, -1)
+        for _ in range(self.data.t_ini):
+            self.past.append(u, self.y)
+            self.y = self.port.step(u)
+        self.p = torch.zeros(*self.batch, self.data.t_ini, self.data.n_y, dtype=torch.float64)
+
+    def advance(self, steps: Iterable[int], progress: Callable[[int], None] | None = None) -> tuple[Tensor, ...]:
+        """Make some steps and return u, y, p and status of each, with the time before their own dimensions."""
+        us, ys, ps, statuses = [], [], [], []
+        for k in steps:
+            ys.append(self.y)
+            us.append(self._step(k))
+            ps.append(self.p)
+            statuses.append(torch.as_tensor(self.controller.status))
+            if progress is not None:
+                progress(1)
+        return torch.stack(us, -2), torch.stack(ys, -2), torch.stack(ps, -3), torch.stack(statuses, -1)
+
+    def _step(self, k: int) -> Tensor:
+        """Make step k and return the inputs that were applied."""
+        u_ini, y_ini = self.past.windows()
+        ahead = slice(k, k + self.data.horizon)
+        refs = {"y_ref": self.y_refs[..., ahead, :], "u_ref": self.u_refs[..., ahead, :]}
+        if self.attack is not None and self.controller.replans_now:
+            self.p = self.attack(u_ini, y_ini, **refs, generator=self.generator, step=k)
+        u = self.controller.step(u_ini, y_ini + self.p, **refs)
+        self.past.append(u, self.y)
+        self.y = self.port.step(u)
+        return u
+
+
+def side_by_side(attacks: Sequence[Attack]) -> Attack:
+    """Return one attack on a batch that asks one attack a run."""
+
+    def attack(u_ini: Tensor, y_ini: Tensor, *, y_ref: Tensor, u_ref: Tensor, generator: Any, step: int) -> Tensor:
+        if y_ini.ndim != 3 or len(attacks) != len(y_ini):
+            raise ValueError(
+                f"`attack` must hold one attack a run, got {len(attacks)} for runs {tuple(y_ini.shape[:-2])}."
+            )
+
+        def of(i: int, values: Tensor) -> Tensor:
+            return values[i] if values.ndim > 2 else values
+
+        return torch.stack(
+            [
+                one(
+                    u_ini[i], y_ini[i], y_ref=of(i, y_ref), u_ref=of(i, u_ref), step=step,
+                    generator=generator[i] if isinstance(generator, Sequence) else generator,
+                )
+                for i, one in enumerate(attacks)
+            ]
+        )  # fmt: skip
+
+    return attack
