@@ -17,7 +17,7 @@ from ..attacks import costs
 from ..attacks.budgets import Budget
 from ..checks import check_count
 from ..control.controller import DPCController
-from ..control.simulation import _trajectory
+from ..control.references import reference_trajectory
 from ..systems.plant import Plant, Port, per_input
 
 Array = NDArray[np.float64]
@@ -94,8 +94,8 @@ class AttackEnv(gymnasium.Env[Array, Array]):
         self.steps, self._start, self._port = check_count("steps", steps), start, port
         y_ref = torch.zeros(data.n_y) if y_ref is None else y_ref
         u_ref = torch.zeros(data.n_u) if u_ref is None else u_ref
-        self._y_refs = _trajectory("y_ref", y_ref, steps, data.n_y, data.horizon)
-        self._u_refs = _trajectory("u_ref", u_ref, steps, data.n_u, data.horizon)
+        self._y_refs = reference_trajectory("y_ref", y_ref, steps, data.n_y, data.horizon)
+        self._u_refs = reference_trajectory("u_ref", u_ref, steps, data.n_u, data.horizon)
         self._warmup = per_input("u_warmup", u_warmup, data.n_u)
         self._t_ini, self._horizon = data.t_ini, data.horizon
         width = (data.t_ini + data.horizon) * (data.n_u + data.n_y) + 1
