@@ -127,13 +127,14 @@ class Plan(torch.autograd.Function):
         if not bars:
             return (None,) * len(ctx.needs_input_grad)
         need, solver = ctx.needs_input_grad, ctx.solver
+        saved = ctx.saved_tensors  # once: torch's checkpoints unpack them once
         is_final = not torch.is_grad_enabled() and all(map(is_plain, bars))  # nothing will be derived again
         if is_final and solver.single is not None and solver.full is None and not (ctx.may_fail or any(need[1:])):
-            active = ctx.saved_tensors[1]
+            active = saved[1]
             theta_bar = solver.single.adjoint(active, u_bar, y_bar, lam_bar) if active.ndim == 1 else None
             if theta_bar is not None:
                 return theta_bar, *(None,) * (len(need) - 1)
-        at = _At(ctx)
+        at = _At(ctx, saved)
         v_bar = joined(solver.sizes, u_bar, y_bar, du_bar, at.lam)
         if ctx.may_fail:  # samples without a solution add nothing, whatever came back for their NaN
             solved = at.solved
@@ -161,7 +162,7 @@ class Plan(torch.autograd.Function):
         _on_failure: None,
         *of_sets_t: Tensor | None,
     ) -> tuple[Tensor | None, ...]:
-        at = _At(ctx)
+        at = _At(ctx, ctx.saved_tensors)
         free = torch.zeros_like(at.lam)
         if theta_t is not None:
             free = free + times(at.C, times(at.A, theta_t))
@@ -205,7 +206,7 @@ class _At:
     Vectors are in the order of v. For sets that are no boxes the system works in part order.
     """
 
-    def __init__(self, ctx: Any):
+    def __init__(self, ctx: Any, saved: tuple[Tensor, ...]):
         solver: Solver = ctx.solver
         self.solver, self.is_box = solver, ctx.sets.is_box
         if not self.is_box and ctx.sets.versions() != ctx.versions:
@@ -213,19 +214,19 @@ class _At:
                 "a parameter of a set (a bound, a radius, ...) was changed in place between the plan and its "
                 "derivative: take the derivative first."
             )
-        self.lam, active, self._info, *saved = ctx.saved_tensors
+        self.lam, active, self._info, *rest = saved
         reduction = solver.reduction
         self.A, self.C, self.G = reduction.A_theta, reduction.rows.C, reduction.G
         self.has_graph = ctx.has_matrices
         if ctx.has_matrices:
-            self.theta, self.A, self.C, self.G, *saved = saved
+            self.theta, self.A, self.C, self.G, *rest = rest
         self.may_fail = ctx.may_fail
         self.active = active
         if self.is_box:
             self.bound_shapes = ctx.bound_shapes
             self.D: Blocks = [active]
             return
-        u, y, du, weak, *self.of_sets = saved
+        u, y, du, weak, *self.of_sets = rest
         self.sets = ctx.sets
         v = torch.where(self.solved, joined(solver.sizes, u, y, du, self.lam), 0.0)
         # x carries the graph of v and lam: a derivative of the derivative knows how the point that is projected moves.
