@@ -1,0 +1,64 @@
+"""How strongly a plan depends on the measured outputs, and what noise and ridges in the recorded data change."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import replace
+
+import torch
+from torch import Tensor
+
+import torch_dpc as dpc
+
+NOISE_SEED = 7000  # the noise of a recording of seed s is drawn from NOISE_SEED + s
+
+
+def plan_gain(layer: dpc.DPCLayer) -> float:
+    """Return max |u(y_ini + p) - u(y_ini)| / |p| of the plan without its bounds, the spectral norm of du / dy_ini."""
+    data = layer.data
+    V = layer.reduction.V  # v = V theta, theta = (u_ini, y_ini, u_ref, y_ref), v = (u, y)
+    first = data.t_ini * data.n_u
+    block = V[: data.horizon * data.n_u, first : first + data.t_ini * data.n_y]
+    return float(torch.linalg.matrix_norm(block, 2))
+
+
+def with_noise(y: Tensor, size: float, seed: int) -> Tensor:
+    """Return recorded outputs `(T, n_y)` with noise of standard deviation size x that of each output."""
+    generator = torch.Generator().manual_seed(NOISE_SEED + seed)
+    return y + size * y.std(0) * torch.randn(y.shape, dtype=y.dtype, generator=generator)
+
+
+def with_ridge(data: dpc.HankelData, y: Tensor, size: float) -> dpc.HankelData:
+    """Return the data with one more window for each past output i: sqrt(n_g) size std(y_i) there, 0 elsewhere.
+
+    The problem depends on the recorded windows D through D D' alone. Independent noise of this size adds, on average,
+    n_g size^2 std(y_i)^2 to the diagonal of D D'; these windows add exactly that to the part of Yp.
+
+    Args:
+        data: of a recording.
+        y: its outputs, `(T, n_y)`.
+        size: relative to the standard deviation of each output.
+    """
+    if size == 0:
+        return data
+    entries = math.sqrt(data.n_g) * size * y.std(0).repeat(data.t_ini)
+
+    def wider(matrix: Tensor) -> Tensor:
+        return torch.cat([matrix, torch.zeros(len(matrix), len(entries), dtype=matrix.dtype)], dim=1)
+
+    Yp = torch.cat([data.Yp, torch.diag(entries)], dim=1)
+    return replace(data, Up=wider(data.Up), Yp=Yp, Uf=wider(data.Uf), Yf=wider(data.Yf))
+
+
+def unexplained(data: dpc.HankelData, y: Tensor) -> Tensor:
+    """Return the root mean squares of what the inputs do not explain of the past outputs, direction by direction.
+
+    The singular values of Yp, each output divided by its standard deviation, less its projection on the rows of Up and
+    Uf, over sqrt(n_g). A direction below the noise of a recording cannot be seen in it.
+
+    Returns:
+        `(t_ini n_y,)`, falling.
+    """
+    inputs = torch.linalg.qr(torch.cat([data.Up, data.Uf]).mT).Q
+    outputs = data.Yp / y.std(0).repeat(data.t_ini)[:, None]
+    return torch.linalg.svdvals(outputs - (outputs @ inputs) @ inputs.mT) / math.sqrt(data.n_g)
