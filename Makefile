@@ -55,7 +55,8 @@ sanitize: $(ENV)  ## the kernels under the address, undefined-behaviour and thre
 	LD_PRELOAD=$$(gcc -print-file-name=libtsan.so) $(PY) tests/solve/fuzz_kernels.py 20000 $(call SANITIZED,thread)
 	export LD_PRELOAD="$$(gcc -print-file-name=libasan.so) $$(gcc -print-file-name=libubsan.so)" ASAN_OPTIONS=detect_leaks=0; \
 	$(PY) tests/solve/fuzz_kernels.py 20000 $(call SANITIZED,address) && root=$$PWD && cd build/sanitize-address/lib* && \
-	PYTHONPATH=$$PWD $$root/$(PY) -m pytest -q -p no:cacheprovider -k "not without" $$root/tests/solve/test_kernels.py
+	PYTHONPATH=$$PWD $$root/$(PY) -m pytest -q -p no:cacheprovider -k "not without" \
+	$$root/tests/solve/test_kernels.py $$root/tests/solve/test_kernel_sets.py
 
 # The README runs from an empty folder, so that what it imports is the wheel.
 package: $(ENV)  ## sdist and wheel into dist/, tried in a clean environment with the core dependencies alone

@@ -18,7 +18,12 @@ from typing import Any
 import numpy as np
 
 ROOT = Path(__file__).resolve().parents[2]
-SETTINGS = {"hysteresis": 1e-12, "independence": 1e-5, "touching": 1e-10, "primal_dual_steps": 10}
+#: As in torch_dpc/solve/kernels.py, which is not imported; a short proximal point method, for speed.
+SETTINGS = {
+    **{"hysteresis": 1e-12, "independence": 1e-5, "touching": 1e-10, "primal_dual_steps": 10},
+    **{"converged": 1e-13, "good": 1e-10, "close": 1e-11, "newton_steps": 25, "halvings": 12, "rounds": 10},
+    **{"patience": 5, "inner_steps": 20, "bisections": 20, "growth": 10.0, "largest_penalty": 1e7},
+}
 SIZES = (0, 1, 2, 3, 5, 16, 17, 33, 40)
 COUNTS = (0, 1, 2, 7, 100)
 #: What may be said of arguments.
@@ -73,6 +78,9 @@ class Caller:
             x.flags.writeable = False
         if kind == 9:
             return x[:0].copy() if x.ndim else x
+        if kind == 10 and x.dtype == np.int64 and x.size:
+            x = x.copy()
+            x.flat[self.random.integers(x.size)] = self.random.integers(-3, 60)
         return x
 
     def arguments(self, name: str, count: int, n: int) -> list[Any]:
@@ -87,16 +95,47 @@ class Caller:
             return [G, v, lower, lower + 2 * width, out, np.zeros(count, np.int64), flags]
         if name == "solve_active":
             return [G, active, v, out, flags]
+        if name == "solve_sets":
+            return [G, v, self.sets(count, n), out, np.zeros(count, np.int64), flags]
+        if name == "solve_held":
+            return [G, self.sets(count, n), v, normal((count, n)), active, normal((count, n)), out, flags]
         return [G, active, v, normal((count, n)) if self.random.random() < 0.5 else None, out, flags]
+
+    def sets(self, count: int, n: int) -> tuple[Any, ...]:
+        """Intervals, balls and cones on random rows."""
+        rows = self.random.permutation(n)[: self.random.integers(n + 1)]
+        cuts = np.flatnonzero(self.random.random(max(len(rows) - 1, 0)) < 0.4) + 1
+        start = np.array([0, *cuts, len(rows)] if len(rows) else [0])
+        shape = (count, n) if self.random.random() < 0.5 else (n,)
+        lower = self.random.standard_normal(shape)
+        upper = lower + np.abs(self.random.standard_normal(shape))
+        lower[..., rows], upper[..., rows] = -np.inf, np.inf
+        price = None if self.random.random() < 0.5 else self.random.random(shape) + 1e-3
+        kind = self.random.integers(1, 3, len(start) - 1)
+        return (
+            lower,
+            upper,
+            price,
+            kind,
+            start,
+            rows,
+            self.random.standard_normal(len(rows)),
+            self.random.random(len(kind)),
+        )
 
     def call(self, spoils: bool) -> str:
         """Make one call; return how it ended."""
         count, n = int(self.random.choice(COUNTS)), int(self.random.choice(SIZES))
-        name = str(self.random.choice(["solve_boxes", "solve_active", "adjoint"]))
+        name = str(self.random.choice(["solve_boxes", "solve_active", "adjoint", "solve_sets", "solve_held"]))
         arguments = self.arguments(name, count, n)
         if spoils:
             place = self.random.integers(len(arguments))
-            if isinstance(arguments[place], np.ndarray):
+            if isinstance(arguments[place], tuple):
+                parts = list(arguments[place])
+                which = self.random.integers(len(parts))
+                parts[which] = None if parts[which] is None else self.spoil(parts[which])
+                arguments[place] = tuple(parts)
+            elif isinstance(arguments[place], np.ndarray):
                 arguments[place] = self.spoil(arguments[place])
         try:
             getattr(self.kernels, name)(*arguments, self.settings, int(self.random.integers(-1, 4)))

@@ -44,9 +44,7 @@ def test_gradcheck(name, solver, noise):
     layer = bounded_layer(noise, solver=solver)
     inputs = {k: v[0] for k, v in strict_inputs(1, layer=layer).items()}
     x = inputs.pop(name).requires_grad_()
-    assert torch.autograd.gradcheck(
-        lambda x: outputs(layer(**{name: x}, **inputs)), x, check_forward_ad=True
-    )
+    assert torch.autograd.gradcheck(lambda x: outputs(layer(**{name: x}, **inputs)), x, check_forward_ad=True)
 
 
 @pytest.mark.parametrize("batched", [False, True])

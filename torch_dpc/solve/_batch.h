@@ -6,7 +6,7 @@
 #ifndef TORCH_DPC_BATCH_H
 #define TORCH_DPC_BATCH_H
 
-#include "_intervals.h"
+#include "_newton.h"
 
 #if !defined(_WIN32)
 #define HAS_THREADS 1
@@ -27,31 +27,83 @@ INLINE const double *of_sample(const Numbers *numbers, int64_t i) {
     return numbers->data ? numbers->data + i * numbers->stride : NULL;
 }
 
+/* The sets of all samples, as `Sets` are those of one. */
+typedef struct {
+    Numbers lower, upper, price, center, radius;
+    int64_t blocks;
+    const int64_t *kind, *start, *rows;
+} BatchSets;
+
 /* The arguments of every entry point; what one does not take stays empty. */
 typedef struct {
     int64_t count, n;
     Numbers G;
     const Settings *settings;
-    Numbers v0, lower, upper, price; /* solve_intervals */
-    Numbers rhs;                     /* solve_active */
-    Numbers v_bar, lam_bar;          /* adjoint; lam_bar may be missing, and is then zero */
-    const unsigned char *active;     /* (count, n), of the latter two */
-    double *result;                  /* (count, n): lam, the solution, or the adjoint */
-    int64_t *iterations;             /* (count), or NULL */
-    unsigned char *succeeded;        /* (count) */
+    BatchSets sets;
+    Numbers v0;                  /* solve */
+    Numbers rhs;                 /* solve_active, solve_held */
+    Numbers v, lam;              /* solve_held: the solution */
+    Numbers v_bar, lam_bar;      /* adjoint; lam_bar may be missing, and is then zero */
+    const unsigned char *active; /* (count, n): solve_active, adjoint */
+    const unsigned char *weak;   /* (count, n): solve_held */
+    double *result;              /* (count, n): lam, the solution, or the adjoint */
+    int64_t *iterations;         /* (count), or NULL */
+    unsigned char *succeeded;    /* (count) */
 } Batch;
 
-INLINE void solve_sample(const Batch *b, Workspace *w, int64_t i) {
-    const Intervals p = {
+INLINE Intervals intervals_of_sample(const Batch *b, int64_t i) {
+    return (Intervals){
         .G = of_sample(&b->G, i),
         .v0 = of_sample(&b->v0, i),
-        .lower = of_sample(&b->lower, i),
-        .upper = of_sample(&b->upper, i),
-        .price = of_sample(&b->price, i),
+        .lower = of_sample(&b->sets.lower, i),
+        .upper = of_sample(&b->sets.upper, i),
+        .price = of_sample(&b->sets.price, i),
         .settings = b->settings,
     };
-    b->succeeded[i] = (unsigned char)solve_intervals(&p, w, b->iterations + i);
+}
+
+/* The sets of a sample, its intervals from the workspace. */
+INLINE Sets sets_of_sample(const Batch *b, const Workspace *w, int64_t i) {
+    return (Sets){
+        .lower = w->lower,
+        .upper = w->upper,
+        .price = w->price,
+        .blocks = b->sets.blocks,
+        .kind = b->sets.kind,
+        .start = b->sets.start,
+        .rows = b->sets.rows,
+        .center = of_sample(&b->sets.center, i),
+        .radius = of_sample(&b->sets.radius, i),
+    };
+}
+
+INLINE void solve_sample(const Batch *b, Workspace *w, int64_t i) {
+    const Intervals intervals = intervals_of_sample(b, i);
+    int solved = b->sets.blocks == 0 && solve_intervals(&intervals, w, b->iterations + i);
+    if (!solved && (b->sets.blocks > 0 || intervals.price)) {
+        prepare(&intervals, w);
+        const Sets sets = sets_of_sample(b, w, i);
+        solved = solve_curved(&(Problem){intervals.G, intervals.v0, &sets, b->settings}, w, b->iterations + i);
+    }
+    b->succeeded[i] = (unsigned char)solved;
     memcpy(b->result + i * b->n, w->lam, bytes(b->n));
+}
+
+/* result = W (W'G W + diag curvature)^-1 W' rhs, W the directions that the sets hold at the solution. */
+INLINE void solve_held_sample(const Batch *b, Workspace *w, int64_t i) {
+    const Intervals intervals = intervals_of_sample(b, i);
+    const double *G = intervals.G, *rhs = of_sample(&b->rhs, i);
+    double *result = b->result + i * b->n;
+    memset(result, 0, bytes(b->n));
+    b->succeeded[i] = 0;
+    if (!reserve_curved(w)) return;
+    prepare(&intervals, w);
+    const Sets sets = sets_of_sample(b, w, i);
+    scale_multipliers(&sets, w);
+    const Held held = list_held_at_solution(&sets, w, of_sample(&b->v, i), of_sample(&b->lam, i), b->weak + i * b->n);
+    for (int64_t j = 0; j < held.rows; j++) w->rhs[w->rows[j]] = rhs[w->rows[j]];
+    b->succeeded[i] = (unsigned char)solve_held(&sets, w, G, NULL, held, b->settings->least_pivot);
+    for (int64_t j = 0; b->succeeded[i] && j < held.rows; j++) result[w->rows[j]] = w->x[j];
 }
 
 INLINE int64_t list_active(const Batch *b, Workspace *w, int64_t i) {
@@ -97,6 +149,7 @@ typedef void Work(const Batch *, Workspace *, int64_t from, int64_t to);
     }
 #define ENTRY_POINTS(instructions, attribute)                                  \
     FOR_SAMPLES(solve_##instructions, solve_sample, attribute)                 \
+    FOR_SAMPLES(solve_held_##instructions, solve_held_sample, attribute)       \
     FOR_SAMPLES(solve_active_##instructions, solve_active_sample, attribute)   \
     FOR_SAMPLES(adjoint_##instructions, adjoint_sample, attribute)
 
@@ -105,14 +158,16 @@ ENTRY_POINTS(any, )
 ENTRY_POINTS(avx2, __attribute__((target("avx2,fma"))))
 #endif
 
-static Work *solve_work = solve_any, *solve_active_work = solve_active_any, *adjoint_work = adjoint_any;
+static Work *solve_work = solve_any, *solve_held_work = solve_held_any;
+static Work *solve_active_work = solve_active_any, *adjoint_work = adjoint_any;
 static const char *instructions = "any";
 
 static void choose_instructions(void) {
 #if defined(__x86_64__)
     __builtin_cpu_init();
     if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma")) return;
-    solve_work = solve_avx2, solve_active_work = solve_active_avx2, adjoint_work = adjoint_avx2;
+    solve_work = solve_avx2, solve_held_work = solve_held_avx2;
+    solve_active_work = solve_active_avx2, adjoint_work = adjoint_avx2;
     instructions = "avx2";
 #endif
 }

@@ -11,21 +11,13 @@
 #define TORCH_DPC_INTERVALS_H
 
 #include <float.h>
-#include <math.h>
 
-#include "_system.h"
+#include "_sets.h"
 
 /* Sweeps of coordinate descent before the first step: one saves 0.7 of 3.5 steps on the masses, a second one none. */
 enum { SWEEPS = 1 };
 /* Where a row is. The sign is that of its multiplier. */
 enum { FREE = 0, HELD = 1, BEYOND = 2 };
-
-typedef struct {
-    double hysteresis;         /* v + lam must pass a bound by this, relative to 1 + |bound|, for its row to be held */
-    double least_pivot;        /* rows of Ct count as independent if every pivot of G_AA / G_ii is above this */
-    double touching;           /* a row that depends on held rows may miss its bound by this, relative to 1 + |bound| */
-    int64_t primal_dual_steps; /* before the dual method takes over */
-} Settings;
 
 /* The problem of one sample; price is NULL if every interval is hard. */
 typedef struct {
@@ -33,26 +25,34 @@ typedef struct {
     const Settings *settings;
 } Intervals;
 
-INLINE double clip(double x, double lower, double upper) { return x > upper ? upper : x < lower ? lower : x; }
-
 INLINE double slack_at(const Settings *settings, double bound) { return settings->hysteresis * (1.0 + fabs(bound)); }
 
-/* Copy the bounds, and invert the diagonal of G; once for all samples that share them. */
-INLINE void prepare(const Intervals *p, Workspace *w) {
-    for (int64_t i = 0; w->diagonal_source != p->G && i < w->n; i++) {
-        const double diagonal = p->G[i * w->n + i];
-        w->inverse_diagonal[i] = diagonal > DBL_MIN ? 1.0 / diagonal : 0.0;
-    }
+/* Copy the diagonal of G; once for all samples that share it. */
+INLINE void prepare_diagonal(const Intervals *p, Workspace *w) {
+    if (w->diagonal_source == p->G) return;
     w->diagonal_source = p->G;
-    if (w->lower_source == p->lower && w->upper_source == p->upper && w->price_source == p->price) return;
+    for (int64_t i = 0; i < w->n; i++) {
+        w->diagonal[i] = p->G[i * w->n + i];
+        w->inverse_diagonal[i] = w->diagonal[i] > DBL_MIN ? 1.0 / w->diagonal[i] : 0.0;
+    }
+}
+
+/* Copy the bounds, and what v and lam are compared with; once for all samples that share them. */
+INLINE void prepare(const Intervals *p, Workspace *w) {
+    const int knows_diagonal = w->diagonal_source == p->G;
+    prepare_diagonal(p, w);
+    if (knows_diagonal && w->lower_source == p->lower && w->upper_source == p->upper && w->price_source == p->price) return;
     w->lower_source = p->lower, w->upper_source = p->upper, w->price_source = p->price;
     for (int64_t i = 0; i < round_up(w->n, WIDTH); i++) {
         const double lower = i < w->n ? p->lower[i] : -INFINITY, upper = i < w->n ? p->upper[i] : INFINITY;
+        const double price = p->price && i < w->n ? p->price[i] : INFINITY;
+        const double reach = price < INFINITY ? w->diagonal[i] * price : INFINITY;
         const int is_tight = lower == upper; /* always held */
-        w->lower[i] = lower, w->upper[i] = upper;
-        w->price[i] = p->price && i < w->n ? p->price[i] : INFINITY;
+        w->lower[i] = lower, w->upper[i] = upper, w->price[i] = price;
         w->below[i] = is_tight ? -INFINITY : lower - slack_at(p->settings, lower);
         w->above[i] = is_tight ? -INFINITY : upper + slack_at(p->settings, upper);
+        w->bottom[i] = lower - reach, w->top[i] = upper + reach;
+        w->from_held[i] = is_tight ? HELD + BEYOND : BEYOND - HELD;
     }
 }
 
@@ -97,26 +97,28 @@ INLINE int classify_hard(const Workspace *w, int64_t *side, const int64_t *befor
 }
 
 /* The same for intervals with a price. A multiplier counts as the displacement that it makes alone, G_ii lam_i; a row
- * at its price stays where it is until rounding cannot explain it. */
-INLINE int classify_priced(const Intervals *p, const Workspace *w, int64_t *side, const int64_t *before) {
-    int differ = 0;
-    for (int64_t i = 0; i < w->n; i++) {
-        const double diagonal = p->G[i * w->n + i], pushed = w->v[i] + diagonal * w->lam[i];
-        const double reach = diagonal * w->price[i], upper = w->upper[i], lower = w->lower[i];
-        const double slack = slack_at(p->settings, w->v[i]);
-        int64_t now = FREE;
-        if (pushed > upper + reach + (before[i] == BEYOND ? -slack : slack)) now = BEYOND;
-        else if (pushed < lower - reach - (before[i] == -BEYOND ? -slack : slack)) now = -BEYOND;
-        else if (pushed > w->above[i]) now = HELD;
-        else if (pushed < w->below[i]) now = -HELD;
-        differ |= now != before[i];
-        side[i] = now;
+ * beyond its bound stays there until rounding cannot explain it. */
+INLINE int classify_priced(const Settings *settings, const Workspace *w, int64_t *side, const int64_t *before) {
+    mask differ = {0};
+    const vec hysteresis = spread(settings->hysteresis);
+    for (int64_t i = 0; i < w->n; i += WIDTH) {
+        const vec v = load(w->v + i), pushed = v + load(w->diagonal + i) * load(w->lam + i);
+        mask old, from_held;
+        memcpy(&old, before + i, sizeof old);
+        memcpy(&from_held, w->from_held + i, sizeof from_held);
+        const vec slack = hysteresis * (spread(1.0) + absolute(v));
+        const vec top = load(w->top + i) + negate_where((mask)(old == BEYOND), slack);
+        const vec bottom = load(w->bottom + i) - negate_where((mask)(old == -BEYOND), slack);
+        const mask now = (mask)(pushed < load(w->below + i)) - (mask)(pushed > load(w->above + i)) -
+                         (mask)(pushed > top) - ((mask)(pushed < bottom) & from_held);
+        differ |= now ^ old;
+        memcpy(side + i, &now, sizeof now);
     }
-    return !differ;
+    return !any(differ);
 }
 
 INLINE int classify(const Intervals *p, const Workspace *w, int64_t *side, const int64_t *before) {
-    return p->price ? classify_priced(p, w, side, before) : classify_hard(w, side, before);
+    return p->price ? classify_priced(p->settings, w, side, before) : classify_hard(w, side, before);
 }
 
 INLINE int is_held(int64_t side) { return side == HELD || side == -HELD; }
@@ -273,7 +275,7 @@ INLINE int64_t add_row(const Intervals *p, Workspace *w, int64_t i, int64_t k, i
     for (int has_moved = 0; ++*steps <= most; has_moved = 1) {
         if (!ratio_test(p, w, k, *same, &e)) return -1;
         *same = k;
-        const int is_dependent = !(e.slope > settings->least_pivot * p->G[i * w->n + i]);
+        const int is_dependent = !(e.slope > settings->least_pivot * w->diagonal[i]);
         if (is_dependent && !has_moved && e.missing <= settings->touching * (1.0 + fabs(e.bound))) {
             w->skipped[i] = 1; /* the held rows keep it at its bound, up to rounding */
             return k;

@@ -1,6 +1,8 @@
 /* The small systems of one sample after the other, without the dispatch of an array library.
  *
  *     solve_boxes   lam with  v = v0 - G lam,  v - Proj(v + lam) = 0,  the projection on a box
+ *     solve_sets    the same for priced intervals, balls and cones
+ *     solve_held    W (W'G W + diag curvature)^-1 W' rhs, W the directions that the sets hold at a solution
  *     solve_active  s_A = G_AA^-1 rhs_A, zero elsewhere
  *     adjoint       v_bar + s,  s_A = G_AA^-1 (lam_bar - G v_bar)_A
  *
@@ -9,7 +11,11 @@
  *
  *     _vector.h     vectors, and products with rows of G
  *     _system.h     one symmetric system
- *     _intervals.h  the solve of one sample
+ *     _settings.h   tolerances and limits
+ *     _sets.h       intervals, balls and cones
+ *     _held.h       the system on the directions that they hold
+ *     _intervals.h  the solve of one sample for intervals
+ *     _newton.h     and for all sets
  *     _batch.h      batches and threads
  *     here          arguments
  */
@@ -20,7 +26,7 @@
 
 /* --- arguments ---------------------------------------------------------------------------------------------------- */
 
-enum { MAX_BUFFERS = 8 };
+enum { MAX_BUFFERS = 16 };
 
 typedef struct {
     Py_buffer views[MAX_BUFFERS];
@@ -66,15 +72,16 @@ static int take_problem(Buffers *b, PyObject *G, PyObject *vectors, const char *
     return 1;
 }
 
-/* Take numbers `(count, n)`, or `(n,)` for all samples if `may_be_shared`. */
+/* Take numbers `(count, size)`, or `(size,)` for all samples if `may_be_shared`. */
 static int take_rows(
-    Buffers *b, PyObject *object, const char *name, const Batch *batch, int may_be_shared, Numbers *numbers) {
+    Buffers *b, PyObject *object, const char *name, const Batch *batch, int may_be_shared, int64_t size,
+    Numbers *numbers) {
     const Py_buffer *view = take(b, object, name, 'd', 0);
     if (!view) return 0;
     const int is_shared = may_be_shared && view->ndim == 1;
     if (!is_shared && (view->ndim != 2 || view->shape[0] != batch->count)) return misfit(name);
-    if (view->shape[view->ndim - 1] != batch->n) return misfit(name);
-    *numbers = (Numbers){view->buf, is_shared ? 0 : batch->n};
+    if (view->shape[view->ndim - 1] != size) return misfit(name);
+    *numbers = (Numbers){view->buf, is_shared ? 0 : size};
     return 1;
 }
 
@@ -103,12 +110,70 @@ static int take_succeeded(Buffers *b, PyObject *object, const char *name, Batch 
     return 1;
 }
 
-static int take_active(Buffers *b, PyObject *object, Batch *batch) {
-    const Py_buffer *view = take(b, object, "active", '?', 0);
+/* Take flags `(count, n)`. */
+static int take_flags(Buffers *b, PyObject *object, const char *name, const Batch *batch, const unsigned char **flags) {
+    const Py_buffer *view = take(b, object, name, '?', 0);
     if (!view) return 0;
-    if (view->ndim != 2 || view->shape[0] != batch->count || view->shape[1] != batch->n) return misfit("active");
-    batch->active = view->buf;
+    if (view->ndim != 2 || view->shape[0] != batch->count || view->shape[1] != batch->n) return misfit(name);
+    *flags = view->buf;
     return 1;
+}
+
+/* Take int64 numbers `(size,)`; any size is right if it is negative. Return the size, or -1 with an exception. */
+static int64_t take_integers(Buffers *b, PyObject *object, const char *name, int64_t size, const int64_t **integers) {
+    const Py_buffer *view = take(b, object, name, 'q', 0);
+    if (!view) return -1;
+    if (view->ndim != 1 || (size >= 0 && view->shape[0] != size)) return misfit(name) - 1;
+    *integers = view->buf;
+    return view->shape[0];
+}
+
+/* Whether the blocks are disjoint sets of rows, none of them empty. */
+static int are_blocks(const BatchSets *sets, int64_t count, int64_t n) {
+    if (sets->start[0] != 0 || sets->start[sets->blocks] != count || count > n) return 0;
+    for (int64_t b = 0; b < sets->blocks; b++) {
+        if (sets->kind[b] != BALL && sets->kind[b] != CONE) return 0;
+        if (sets->start[b] >= sets->start[b + 1]) return 0;
+    }
+    unsigned char *taken = calloc((size_t)n + 1, 1);
+    int are_disjoint = taken != NULL;
+    for (int64_t j = 0; are_disjoint && j < count; j++) {
+        const int64_t row = sets->rows[j];
+        are_disjoint = row >= 0 && row < n && !taken[row];
+        if (are_disjoint) taken[row] = 1;
+    }
+    free(taken);
+    return are_disjoint;
+}
+
+/* Whether the intervals of the rows of blocks are everything. */
+static int are_unbounded(const Batch *b, int64_t count) {
+    const BatchSets *sets = &b->sets;
+    const int is_shared = sets->lower.stride == 0 && sets->upper.stride == 0;
+    for (int64_t i = 0; i < (is_shared && b->count > 1 ? 1 : b->count); i++) {
+        const double *lower = of_sample(&sets->lower, i), *upper = of_sample(&sets->upper, i);
+        for (int64_t j = 0; j < count; j++)
+            if (lower[sets->rows[j]] != -INFINITY || upper[sets->rows[j]] != INFINITY) return 0;
+    }
+    return 1;
+}
+
+/* Take the tuple (lower, upper, price, kind, start, rows, center, radius); price may be None. */
+static int take_sets(Buffers *b, PyObject *object, Batch *batch) {
+    BatchSets *sets = &batch->sets;
+    if (!PyTuple_Check(object) || PyTuple_GET_SIZE(object) != 8) return misfit("sets");
+    PyObject *const *parts = PySequence_Fast_ITEMS(object);
+    if (!take_rows(b, parts[0], "lower", batch, 1, batch->n, &sets->lower)) return 0;
+    if (!take_rows(b, parts[1], "upper", batch, 1, batch->n, &sets->upper)) return 0;
+    if (parts[2] != Py_None && !take_rows(b, parts[2], "price", batch, 1, batch->n, &sets->price)) return 0;
+    if ((sets->blocks = take_integers(b, parts[3], "kind", -1, &sets->kind)) < 0) return 0;
+    if (take_integers(b, parts[4], "start", sets->blocks + 1, &sets->start) < 0) return 0;
+    const int64_t count = take_integers(b, parts[5], "rows", -1, &sets->rows);
+    if (count < 0) return 0;
+    if (!take_rows(b, parts[6], "center", batch, 1, count, &sets->center)) return 0;
+    if (!take_rows(b, parts[7], "radius", batch, 1, sets->blocks, &sets->radius)) return 0;
+    if (!are_blocks(sets, count, batch->n)) return misfit("rows");
+    return are_unbounded(batch, count) || misfit("lower");
 }
 
 static int has_arguments(Py_ssize_t got, Py_ssize_t expected) {
@@ -125,15 +190,21 @@ static void free_settings(PyObject *capsule) { free(PyCapsule_GetPointer(capsule
 
 static PyObject *settings(PyObject *self, PyObject *args, PyObject *keywords) {
     (void)self;
-    static char *names[] = {"hysteresis", "independence", "touching", "primal_dual_steps", NULL};
-    double hysteresis, independence, touching;
-    long long primal_dual_steps;
+    static char *names[] = {"hysteresis", "independence", "touching", "primal_dual_steps", "converged", "good", "close",
+                            "newton_steps", "halvings", "rounds", "patience", "inner_steps", "bisections", "growth",
+                            "largest_penalty", NULL};
+    double independence;
+    Settings s;
+    _Static_assert(sizeof(long long) == sizeof s.rounds, "the format L reads an int64_t");
     if (!PyArg_ParseTupleAndKeywords(
-            args, keywords, "$dddL", names, &hysteresis, &independence, &touching, &primal_dual_steps))
+            args, keywords, "$dddLdddLLLLLLdd", names, &s.hysteresis, &independence, &s.touching, &s.primal_dual_steps,
+            &s.converged, &s.good, &s.close, &s.newton_steps, &s.halvings, &s.rounds, &s.patience, &s.inner_steps,
+            &s.bisections, &s.growth, &s.largest_penalty))
         return NULL;
+    s.least_pivot = independence * independence;
     Settings *made = malloc(sizeof *made);
     if (!made) return PyErr_NoMemory();
-    *made = (Settings){hysteresis, independence * independence, touching, primal_dual_steps};
+    *made = s;
     PyObject *capsule = PyCapsule_New(made, SETTINGS, free_settings);
     if (!capsule) free(made);
     return capsule;
@@ -169,14 +240,43 @@ static PyObject *solve_boxes(PyObject *self, PyObject *const *args, Py_ssize_t c
     void *iterations = NULL;
     if (!has_arguments(count, 9)) return NULL;
     const int is_ready = take_problem(&held, args[0], args[1], "v0", &b, &b.v0) &&
-                         take_rows(&held, args[2], "lower", &b, 1, &b.lower) &&
-                         take_rows(&held, args[3], "upper", &b, 1, &b.upper) &&
-                         (b.lower.stride == b.upper.stride || misfit("upper")) &&
+                         take_rows(&held, args[2], "lower", &b, 1, b.n, &b.sets.lower) &&
+                         take_rows(&held, args[3], "upper", &b, 1, b.n, &b.sets.upper) &&
+                         (b.sets.lower.stride == b.sets.upper.stride || misfit("upper")) &&
                          take_result(&held, args[4], "lam", &b) &&
                          take_counts(&held, args[5], "iterations", 'q', &b, &iterations) &&
                          take_succeeded(&held, args[6], "converged", &b) && take_options(args + 7, &b, &threads);
     b.iterations = iterations;
     return finish(&held, is_ready, &b, solve_work, threads);
+}
+
+static PyObject *solve_sets(PyObject *self, PyObject *const *args, Py_ssize_t count) {
+    (void)self;
+    Buffers held = {.count = 0};
+    Batch b = {0};
+    int64_t threads = 1;
+    void *iterations = NULL;
+    if (!has_arguments(count, 8)) return NULL;
+    const int is_ready = take_problem(&held, args[0], args[1], "v0", &b, &b.v0) && take_sets(&held, args[2], &b) &&
+                         take_result(&held, args[3], "lam", &b) &&
+                         take_counts(&held, args[4], "iterations", 'q', &b, &iterations) &&
+                         take_succeeded(&held, args[5], "converged", &b) && take_options(args + 6, &b, &threads);
+    b.iterations = iterations;
+    return finish(&held, is_ready, &b, solve_work, threads);
+}
+
+static PyObject *solve_held_directions(PyObject *self, PyObject *const *args, Py_ssize_t count) {
+    (void)self;
+    Buffers held = {.count = 0};
+    Batch b = {0};
+    int64_t threads = 1;
+    if (!has_arguments(count, 10)) return NULL;
+    const int is_ready =
+        take_problem(&held, args[0], args[5], "rhs", &b, &b.rhs) && take_sets(&held, args[1], &b) &&
+        take_rows(&held, args[2], "v", &b, 0, b.n, &b.v) && take_rows(&held, args[3], "lam", &b, 0, b.n, &b.lam) &&
+        take_flags(&held, args[4], "weak", &b, &b.weak) && take_result(&held, args[6], "out", &b) &&
+        take_succeeded(&held, args[7], "trusted", &b) && take_options(args + 8, &b, &threads);
+    return finish(&held, is_ready, &b, solve_held_work, threads);
 }
 
 static PyObject *solve_active(PyObject *self, PyObject *const *args, Py_ssize_t count) {
@@ -186,7 +286,7 @@ static PyObject *solve_active(PyObject *self, PyObject *const *args, Py_ssize_t 
     int64_t threads = 1;
     if (!has_arguments(count, 7)) return NULL;
     const int is_ready = take_problem(&held, args[0], args[2], "rhs", &b, &b.rhs) &&
-                         take_active(&held, args[1], &b) && take_result(&held, args[3], "out", &b) &&
+                         take_flags(&held, args[1], "active", &b, &b.active) && take_result(&held, args[3], "out", &b) &&
                          take_succeeded(&held, args[4], "trusted", &b) && take_options(args + 5, &b, &threads);
     return finish(&held, is_ready, &b, solve_active_work, threads);
 }
@@ -198,8 +298,8 @@ static PyObject *adjoint(PyObject *self, PyObject *const *args, Py_ssize_t count
     int64_t threads = 1;
     if (!has_arguments(count, 8)) return NULL;
     const int is_ready = take_problem(&held, args[0], args[2], "v_bar", &b, &b.v_bar) &&
-                         take_active(&held, args[1], &b) &&
-                         (args[3] == Py_None || take_rows(&held, args[3], "lam_bar", &b, 0, &b.lam_bar)) &&
+                         take_flags(&held, args[1], "active", &b, &b.active) &&
+                         (args[3] == Py_None || take_rows(&held, args[3], "lam_bar", &b, 0, b.n, &b.lam_bar)) &&
                          take_result(&held, args[4], "out", &b) && take_succeeded(&held, args[5], "trusted", &b) &&
                          take_options(args + 6, &b, &threads);
     return finish(&held, is_ready, &b, adjoint_work, threads);
@@ -210,10 +310,13 @@ static PyObject *adjoint(PyObject *self, PyObject *const *args, Py_ssize_t count
 #define FUNCTION(name) ((PyCFunction)(void (*)(void))(name))
 
 static PyMethodDef methods[] = {
-    {"settings", FUNCTION(settings), METH_VARARGS | METH_KEYWORDS,
-     "settings(*, hysteresis, independence, touching, primal_dual_steps)"},
+    {"settings", FUNCTION(settings), METH_VARARGS | METH_KEYWORDS, "settings(**settings)"},
     {"solve_boxes", FUNCTION(solve_boxes), METH_FASTCALL,
      "solve_boxes(G, v0, lower, upper, lam, iterations, converged, settings, threads)"},
+    {"solve_sets", FUNCTION(solve_sets), METH_FASTCALL,
+     "solve_sets(G, v0, sets, lam, iterations, converged, settings, threads)"},
+    {"solve_held", FUNCTION(solve_held_directions), METH_FASTCALL,
+     "solve_held(G, sets, v, lam, weak, rhs, out, trusted, settings, threads)"},
     {"solve_active", FUNCTION(solve_active), METH_FASTCALL,
      "solve_active(G, active, rhs, out, trusted, settings, threads)"},
     {"adjoint", FUNCTION(adjoint), METH_FASTCALL,

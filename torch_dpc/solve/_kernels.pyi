@@ -6,7 +6,7 @@ from numpy import ndarray
 
 instructions: str
 
-def settings(*, hysteresis: float, independence: float, touching: float, primal_dual_steps: int) -> Any: ...
+def settings(**settings: float) -> Any: ...
 def solve_boxes(
     G: ndarray,
     v0: ndarray,
@@ -15,6 +15,30 @@ def solve_boxes(
     lam: ndarray,
     iterations: ndarray,
     converged: ndarray,
+    settings: Any,
+    threads: int,
+    /,
+) -> None: ...
+def solve_sets(
+    G: ndarray,
+    v0: ndarray,
+    sets: tuple[ndarray | None, ...],
+    lam: ndarray,
+    iterations: ndarray,
+    converged: ndarray,
+    settings: Any,
+    threads: int,
+    /,
+) -> None: ...
+def solve_held(
+    G: ndarray,
+    sets: tuple[ndarray | None, ...],
+    v: ndarray,
+    lam: ndarray,
+    weak: ndarray,
+    rhs: ndarray,
+    out: ndarray,
+    trusted: ndarray,
     settings: Any,
     threads: int,
     /,

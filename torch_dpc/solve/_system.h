@@ -12,6 +12,23 @@
 
 enum { CACHE_LINE = 64 }; /* bytes; a vector that crosses a line costs twice */
 
+/* The memory of sets with curved blocks; made only if there are any. Vectors have N entries. */
+typedef struct {
+    void *memory;
+    double *gamma, *reach;      /* scale of the multipliers; what is added to the diagonal of G */
+    double *origin;             /* v0, plus reach times the multipliers that the proximal point method starts from */
+    double *pushed, *updated;   /* v + gamma lam, and the multipliers that follow from it */
+    double *target, *v_target;  /* where a Newton step leads, and v there */
+    double *best, *proximal;    /* the best multipliers yet; the center of the proximal point method */
+    double *trial, *v_trial;    /* along the step */
+    double *reflector, *curvature, *sign; /* the held directions of the blocks, see _sets.h */
+    double *packed;             /* entries of a sparse vector */
+    int64_t *places;            /* and where they are */
+    int64_t *state;             /* of the blocks */
+} Curved;
+
+enum { CURVED_VECTORS = 17 };
+
 /* The memory of one thread. Vectors have N entries, and zeros after them up to a whole block. */
 typedef struct {
     void *vectors_memory, *U_memory; /* what is to be freed */
@@ -26,13 +43,17 @@ typedef struct {
     double *start;                   /* v0 less what the multipliers that are known take of it */
     double *lower, *upper, *price;   /* the intervals */
     double *below, *above;           /* what v + lam must pass for a row to be held at its bound */
+    double *top, *bottom;            /* what v + G_ii lam must pass for a row to be beyond its bound */
+    double *diagonal;                /* G_ii */
     double *inverse_diagonal;        /* 1 / G_ii; 0 if nothing moves the row */
     const double *lower_source, *upper_source, *price_source, *diagonal_source; /* what these were copied from */
+    int64_t *from_held;              /* steps of `side` from where `below` puts a row to beyond its lower bound */
     int64_t *side, *new_side;        /* where each row is, see _intervals.h */
     int64_t *skipped;                /* rows that `goldfarb_idnani` passes over */
+    Curved curved;
 } Workspace;
 
-enum { VECTORS = 16 }; /* of a workspace */
+enum { VECTORS = 20 }; /* of a workspace */
 
 static int64_t round_up(int64_t n, int64_t to) { return (n + to - 1) / to * to; }
 
@@ -47,6 +68,7 @@ static void *allocate(void **memory, int64_t count) {
 }
 
 static void free_workspace(Workspace *w) {
+    free(w->curved.memory);
     free(w->U_memory);
     free(w->vectors_memory);
 }
@@ -61,9 +83,27 @@ static int new_workspace(Workspace *w, int64_t n) {
     double *next = allocate(&w->vectors_memory, count);
     if (!next) return 0;
     memset(next, 0, bytes(count));
-    double **vectors[] = {&w->inverse_pivots, &w->rhs,   &w->x,     &w->v,     &w->lam,   &w->start,
-                          &w->lower,          &w->upper, &w->price, &w->below, &w->above, &w->inverse_diagonal};
-    int64_t **integers[] = {&w->rows, &w->side, &w->new_side, &w->skipped};
+    double **vectors[] = {&w->inverse_pivots, &w->rhs,   &w->x,   &w->v,      &w->lam,      &w->start, &w->lower, &w->upper,
+                          &w->price,          &w->below, &w->above, &w->top, &w->bottom, &w->diagonal, &w->inverse_diagonal};
+    int64_t **integers[] = {&w->rows, &w->from_held, &w->side, &w->new_side, &w->skipped};
+    for (size_t i = 0; i < sizeof vectors / sizeof *vectors; i++, next += width) *vectors[i] = next;
+    for (size_t i = 0; i < sizeof integers / sizeof *integers; i++, next += width) *integers[i] = (int64_t *)(void *)next;
+    return 1;
+}
+
+/* Make the memory for curved blocks, if it is not there yet; return 0 without memory. */
+static int reserve_curved(Workspace *w) {
+    Curved *c = &w->curved;
+    const int64_t width = round_up(w->n + 1, BLOCK);
+    int64_t count;
+    if (c->memory) return 1;
+    if (__builtin_mul_overflow(CURVED_VECTORS, width, &count)) return 0;
+    double *next = allocate(&c->memory, count);
+    if (!next) return 0;
+    memset(next, 0, bytes(count));
+    double **vectors[] = {&c->gamma, &c->reach,   &c->origin, &c->pushed,  &c->updated,   &c->target,    &c->v_target, &c->best,
+                          &c->proximal, &c->trial, &c->v_trial, &c->reflector, &c->curvature, &c->sign, &c->packed};
+    int64_t **integers[] = {&c->places, &c->state};
     for (size_t i = 0; i < sizeof vectors / sizeof *vectors; i++, next += width) *vectors[i] = next;
     for (size_t i = 0; i < sizeof integers / sizeof *integers; i++, next += width) *integers[i] = (int64_t *)(void *)next;
     return 1;

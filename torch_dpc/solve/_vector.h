@@ -26,6 +26,12 @@ INLINE vec spread(double s) { return (vec){s, s, s, s}; }
 
 INLINE double sum(vec x) { return (x[0] + x[2]) + (x[1] + x[3]); }
 
+INLINE vec absolute(vec x) { return (vec)((mask)x & (mask){INT64_MAX, INT64_MAX, INT64_MAX, INT64_MAX}); }
+
+INLINE vec negate_where(mask m, vec x) {
+    return (vec)((mask)x ^ (m & (mask){INT64_MIN, INT64_MIN, INT64_MIN, INT64_MIN}));
+}
+
 INLINE int any(mask m) { return (m[0] | m[1] | m[2] | m[3]) != 0; }
 
 INLINE size_t bytes(int64_t doubles) { return (size_t)doubles * sizeof(double); }

@@ -17,6 +17,9 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ..sets.values import SetValues
+from .outcome import Found
+
 try:
     if os.environ.get("TORCH_DPC_NO_KERNELS", "0") not in ("", "0"):
         raise ImportError("switched off")
@@ -40,6 +43,25 @@ class KernelSettings:
     touching: float = 1e-10
     #: Steps of the primal-dual method after which the dual method takes over; samples that converge need 1 to 8.
     primal_dual_steps: int = 10
+    #: |v - P(v + gamma lam)| relative to 1 + |v| at which Newton's method ends: a hundred roundings.
+    converged: float = 1e-13
+    #: The same, at which its result counts as a solution; the judgement of plans asks for less.
+    good: float = 1e-10
+    #: The same, at which the proximal point method leaves the rest to Newton's method.
+    close: float = 1e-11
+    #: Newton steps and halvings of one; samples that converge need 3 to 8 steps.
+    newton_steps: int = 25
+    halvings: int = 12
+    #: Rounds of the proximal point method, and how many it may go on without halving the residual.
+    rounds: int = 60
+    patience: int = 20
+    #: Newton steps of a round, and bisections of one.
+    inner_steps: int = 40
+    bisections: int = 40
+    #: The penalty begins at 1 / gamma and grows by this from round to round, up to the largest times 1 / gamma. Beyond
+    #: it rounding grows with the penalty.
+    growth: float = 10.0
+    largest_penalty: float = 1e7
 
     @cached_property
     def compiled(self) -> Any:
@@ -78,6 +100,58 @@ def solve_boxes(
     lam, steps, converged = np.empty_like(v0), np.empty(len(v0), dtype=np.int64), np.empty(len(v0), dtype=bool)
     _kernels.solve_boxes(G, v0, lower, upper, lam, steps, converged, SETTINGS.compiled, threads)
     return lam, steps, converged
+
+
+def has_kernel_for(v0: Tensor, values: SetValues | None) -> bool:
+    """Return whether the kernels solve these samples.
+
+    Args:
+        v0: the unconstrained minimisers.
+        values: the sets as numbers; None for a set that only torch knows.
+    """
+    return _kernels is not None and v0.device.type == "cpu" and values is not None
+
+
+def solve_sets(G: Tensor, v0: Tensor, values: SetValues) -> Found:
+    """Solve  v = v0 - G lam = P(v + lam)  for every sample, P the proximal map of the sets.
+
+    Args:
+        G: `(N, N)`, or one a sample, `(B, N, N)`.
+        v0: `(B, N)`.
+        values: the sets.
+    """
+    lam, steps, converged = np.empty(v0.shape), np.empty(len(v0), dtype=np.int64), np.empty(len(v0), dtype=bool)
+    options = SETTINGS.compiled, torch.get_num_threads()
+    _kernels.solve_sets(as_array(G), as_array(v0), set_arrays(values), lam, steps, converged, *options)
+    return Found(*map(torch.from_numpy, (lam, steps, converged)))
+
+
+def adjoint_sets(
+    G: Tensor, v: Tensor, lam: Tensor, weak: Tensor, values: SetValues, rhs: Tensor
+) -> tuple[Tensor, Tensor]:
+    """Return S rhs `(B, N)`, S = W (W'G W + K)^-1 W', and which samples had independent directions `(B,)`.
+
+    W holds the directions that the sets hold at the solution, K the curvature of their boundaries.
+
+    Args:
+        G: `(N, N)`, or one a sample, `(B, N, N)`.
+        v, lam: the solution, `(B, N)`.
+        weak: the rows whose multiplier counts as zero, `(B, N)`, boolean; a block is free if all of its rows are.
+        values: the sets.
+        rhs: `(B, N)`.
+    """
+    out, trusted = np.empty(rhs.shape), np.empty(len(rhs), dtype=bool)
+    at = as_array(v), as_array(lam), as_array(weak), as_array(rhs)
+    options = SETTINGS.compiled, torch.get_num_threads()
+    _kernels.solve_held(as_array(G), set_arrays(values), *at, out, trusted, *options)
+    return torch.from_numpy(out), torch.from_numpy(trusted)
+
+
+def set_arrays(values: SetValues) -> tuple[np.ndarray | None, ...]:
+    """Return sets as the kernels read them: lower, upper, price, kind, start, rows, center, radius."""
+    price = None if values.price is None else as_array(values.price)
+    rest = values.kind, values.start, values.rows, values.center, values.radius
+    return as_array(values.lower), as_array(values.upper), price, *map(as_array, rest)
 
 
 def solve_active(G: Tensor, active: Tensor, rhs: Tensor) -> tuple[Tensor, Tensor]:

@@ -1,0 +1,227 @@
+"""The compiled kernel for priced intervals, balls and cones against projections and differences of its own."""
+
+import numpy as np
+import pytest
+import torch
+
+from helpers import randn
+from torch_dpc.sets.values import BALL, CONE, SetValues
+from torch_dpc.solve import kernels
+
+pytestmark = pytest.mark.skipif(kernels._kernels is None, reason="the extension is not built here (no compiler)")
+
+#: |v - P(v + lam)| relative to 1 + |v|.
+SAME = 1e-11
+#: Central differences with steps of 1e-6.
+DIFFERENCES = 1e-6
+
+
+class Problem:
+    """A random product of sets that some x meets, and samples v0; its projections are written anew here."""
+
+    def __init__(self, seed, count=20, n_x=None, prices=0.5, kinds=(BALL, CONE), shared=True):
+        self.random = np.random.default_rng(seed)
+        sizes = [int(self.random.integers(1, 6)) for _ in range(int(self.random.integers(1, 10)) if kinds else 0)]
+        self.kind = [int(self.random.choice(kinds)) for _ in sizes]
+        intervals = int(self.random.integers(0 if sizes else 1, 20))
+        self.n = sum(sizes) + intervals
+        order = self.random.permutation(self.n).tolist()
+        self.blocks = [order[sum(sizes[:b]) : sum(sizes[: b + 1])] for b in range(len(sizes))]
+        self.intervals = order[sum(sizes) :]
+        n_x = n_x or self.n + 3
+        lead = () if shared else (count,)
+        Ct = self.random.standard_normal((*lead, self.n, n_x)) / n_x**0.5
+        self.G = Ct @ Ct.swapaxes(-1, -2)
+        reached = self._reached(prices)
+        self.v0 = reached + (Ct @ self.random.standard_normal((count, n_x, 1)))[..., 0] * 1.5
+
+    def _reached(self, prices):
+        """Draw the sets around a point that is returned."""
+        normal, point = self.random.standard_normal, np.zeros(self.n)
+        self.lower, self.upper = np.full(self.n, -np.inf), np.full(self.n, np.inf)
+        self.price = np.full(self.n, np.inf)
+        self.center, self.radius = [], []
+        for kind, block in zip(self.kind, self.blocks, strict=True):
+            point[block] = normal(len(block)) * 0.4
+            if kind == CONE:
+                point[block[0]] = np.linalg.norm(point[block[1:]]) + abs(normal()) * 0.3
+            self.center.append(point[block] if kind == BALL else np.zeros(len(block)))
+            self.radius.append(abs(normal()) * 0.5 if kind == BALL else 0.0)
+        for i in self.intervals:
+            point[i], width = normal(), abs(normal()) * 0.4
+            self.lower[i] = point[i] - width if self.random.random() < 0.85 else -np.inf
+            self.upper[i] = point[i] + width if self.random.random() < 0.85 else np.inf
+            if self.random.random() < prices:
+                self.price[i] = abs(normal()) + 0.01
+        return point
+
+    @property
+    def values(self):
+        rows = [i for block in self.blocks for i in block]
+        start = np.cumsum([0, *map(len, self.blocks)])
+        center = np.concatenate([*self.center, np.zeros(0)])
+        integers = (torch.tensor(x, dtype=torch.int64) for x in (self.kind, start, rows))
+        price = None if np.isinf(self.price).all() else torch.from_numpy(self.price)
+        bounds = torch.from_numpy(self.lower), torch.from_numpy(self.upper), price
+        return SetValues(*bounds, *integers, torch.from_numpy(center), torch.tensor(self.radius, dtype=torch.float64))
+
+    def prox(self, x):
+        """The proximal map with gamma = 1."""
+        pull = x - np.clip(x, self.lower, self.upper)
+        out = x - np.clip(pull, -self.price, self.price)
+        for kind, block, center, radius in zip(self.kind, self.blocks, self.center, self.radius, strict=True):
+            part = x[..., block]
+            if kind == BALL:
+                size = np.linalg.norm(part - center, axis=-1, keepdims=True)
+                shrunk = center + radius * (part - center) / np.where(size > 0, size, 1.0)
+                out[..., block] = np.where(size > radius, shrunk, part)
+            else:
+                head, size = part[..., :1], np.linalg.norm(part[..., 1:], axis=-1, keepdims=True)
+                half = (head + size) / 2
+                edge = np.concatenate([half, half * part[..., 1:] / np.where(size > 0, size, 1.0)], axis=-1)
+                out[..., block] = np.where(size <= head, part, np.where(size <= -head, 0.0, edge))
+        return out
+
+    def solve(self, v0=None):
+        found = kernels.solve_sets(
+            torch.from_numpy(self.G), torch.from_numpy(self.v0 if v0 is None else v0), self.values
+        )
+        return found.lam.numpy(), found.converged.numpy()
+
+    def v_of(self, lam, v0=None):
+        return (self.v0 if v0 is None else v0) - (self.G @ lam[..., None])[..., 0]
+
+    def residual(self, lam):
+        v = self.v_of(lam)
+        return np.abs(v - self.prox(v + lam)).max() / (1 + np.abs(v).max())
+
+
+MIXTURES = {
+    "all": {},
+    "dependent rows": {"n_x": 5},
+    "balls": {"kinds": (BALL,), "prices": 0.0},
+    "cones": {"kinds": (CONE,), "prices": 0.0},
+    "priced": {"kinds": (), "prices": 0.7},
+    "priced, dependent rows": {"kinds": (), "prices": 0.7, "n_x": 4},
+    "one problem a sample": {"shared": False},
+}
+
+
+@pytest.mark.parametrize("seed", range(12))
+@pytest.mark.parametrize("mixture", MIXTURES)
+def test_random_sets_meet_their_conditions(mixture, seed):
+    problem = Problem(seed, **MIXTURES[mixture])
+    lam, converged = problem.solve()
+    assert converged.all()
+    assert problem.residual(lam) < SAME
+
+
+def test_a_hard_price_is_a_hard_bound():
+    problem = Problem(3, kinds=(), prices=0.0)
+    hard, _ = problem.solve()
+    problem.price[:] = 1e9
+    priced, converged = problem.solve()
+    assert converged.all() and np.abs(hard).max() > 0.1
+    np.testing.assert_allclose(priced, hard, atol=1e-10)
+
+
+def test_infeasible_problems_with_a_price_are_solved_and_others_flagged():
+    problem = Problem(4, kinds=(), prices=0.0, n_x=2)
+    i, j = problem.intervals[:2]
+    problem.lower[i], problem.upper[i] = 60.0, 61.0  # two unknowns do not bring both there
+    problem.lower[j], problem.upper[j] = 60.0, 61.0
+    problem.lower[problem.intervals[2]], problem.upper[problem.intervals[2]] = -61.0, -60.0
+    lam, converged = problem.solve()
+    assert not converged.any()
+    problem.price[:] = 2.0
+    lam, converged = problem.solve()
+    assert converged.all() and problem.residual(lam) < SAME
+
+
+@pytest.mark.parametrize("dual", [False, True])
+@pytest.mark.parametrize("seed", range(6))
+def test_priced_intervals_by_either_method(seed, dual, monkeypatch):
+    monkeypatch.setattr(kernels, "SETTINGS", kernels.KernelSettings(primal_dual_steps=0 if dual else 10))
+    problem = Problem(seed, kinds=(), prices=0.8, n_x=6, count=50)
+    lam, converged = problem.solve()
+    assert converged.all() and problem.residual(lam) < SAME
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_curved_sets_by_the_proximal_point_method_alone(seed, monkeypatch):
+    settings = kernels.KernelSettings(newton_steps=0, good=1e-9, close=1e-12)
+    monkeypatch.setattr(kernels, "SETTINGS", settings)
+    problem = Problem(seed)
+    lam, converged = problem.solve()
+    assert converged.all() and problem.residual(lam) < 1e-8
+
+
+@pytest.mark.parametrize("seed", range(8))
+@pytest.mark.parametrize("mixture", ["all", "balls", "cones", "priced", "one problem a sample"])
+def test_the_operator_of_derivatives_against_differences(mixture, seed):
+    problem = Problem(seed, count=4, **MIXTURES[mixture])
+    lam, _ = problem.solve()
+    v = problem.v_of(lam)
+    direction, step = randn(*v.shape, seed=seed).numpy(), 1e-6
+    weak = np.abs(lam) < 1e-9
+    tensors = (torch.from_numpy(x) for x in (problem.G, v, lam, weak))
+    moved, trusted = kernels.adjoint_sets(*tensors, problem.values, torch.from_numpy(direction))
+    assert trusted.all()
+    ahead, behind = (problem.solve(problem.v0 + sign * step * direction)[0] for sign in (1, -1))
+    expected = (ahead - behind) / (2 * step)
+    error = np.abs(moved.numpy() - expected).max(axis=1) / (1 + np.abs(expected).max(axis=1))
+    assert np.median(error) < DIFFERENCES  # a sample whose active set changes within the step has no derivative there
+
+
+def test_a_weak_block_is_free():
+    problem = Problem(1, kinds=(BALL,), prices=0.0)
+    lam, _ = problem.solve()
+    weak = np.ones_like(lam, dtype=bool)
+    at = (torch.from_numpy(x) for x in (problem.G, problem.v_of(lam), lam, weak))
+    moved, _ = kernels.adjoint_sets(*at, problem.values, torch.ones(*lam.shape, dtype=torch.float64))
+    assert (moved == 0).all()
+
+
+def test_a_sample_does_not_see_the_batch_or_the_threads():
+    problem = Problem(2, count=300)
+    lam, _ = problem.solve()
+    torch.set_num_threads(3)
+    again, _ = problem.solve()
+    torch.set_num_threads(1)
+    assert np.array_equal(lam, again)
+    alone, _ = problem.solve(problem.v0[17:18])
+    assert np.array_equal(alone[0], lam[17])
+
+
+def test_a_value_that_is_not_finite_flags_its_sample_alone():
+    problem = Problem(5, count=3)
+    problem.v0[1, 0] = np.nan
+    _, converged = problem.solve()
+    assert converged.tolist() == [True, False, True]
+
+
+@pytest.mark.parametrize(
+    ("place", "wrong"),
+    [
+        (3, np.array([3])),
+        (3, np.array([1, 1])),
+        (4, np.array([0, 3])),
+        (4, np.array([0, 0, 2])),
+        (5, np.array([0, 5])),
+        (5, np.array([1, 1])),
+        (5, np.array([-1, 0])),
+        (6, np.zeros(3)),
+        (7, np.zeros(2)),
+        (0, np.zeros(5)),
+    ],
+)
+def test_blocks_that_make_no_sense_are_refused(place, wrong):
+    sets = [np.full(5, -np.inf), np.full(5, np.inf), None, np.array([1]), np.array([0, 2]), np.array([0, 1])]
+    sets += [np.zeros(2), np.ones(1)]
+    results = np.zeros((1, 5)), np.zeros(1, dtype=np.int64), np.zeros(1, dtype=bool)
+    options = kernels.SETTINGS.compiled, 1
+    kernels._kernels.solve_sets(np.eye(5), np.ones((1, 5)), tuple(sets), *results, *options)
+    assert results[2].all()
+    sets[place] = wrong
+    with pytest.raises(ValueError, match="does not fit"):
+        kernels._kernels.solve_sets(np.eye(5), np.ones((1, 5)), tuple(sets), *results, *options)
