@@ -15,10 +15,10 @@ MANY = 400  # draws of the noise that is averaged
 NEAR = 0.05  # relative: an entry of the mean of MANY noisy Gram matrices against what the ridge adds
 
 
-def recording(seed=0):
+def recording(seed=0, samples=150):
     case = Masses()
     with case.system() as plant:
-        return case, *case.record(plant, seed, 150)
+        return case, *case.record(plant, seed, samples)
 
 
 def test_the_gain_is_that_of_the_worst_perturbation():
@@ -50,7 +50,7 @@ def test_the_ridge_adds_what_noise_adds_on_average():
 
 
 def test_a_ridge_predicts_the_gain_of_noisy_recordings():
-    case, u, y = recording()
+    case, u, y = recording(samples=None)  # the paper's 500 windows: with few of them the predictor fits the noise
     found = [plan_gain(case.layer(case.hankel(u, with_noise(y, 0.1, seed)))) for seed in range(20)]
     assert plan_gain(case.layer(with_ridge(case.hankel(u, y), y, 0.1))) == pytest.approx(np.mean(found), rel=0.05)
 
