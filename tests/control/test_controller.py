@@ -62,7 +62,7 @@ def test_at_step_k_it_knows_the_steps_before_k():
     torch.testing.assert_close(log.y, y[3:], rtol=0, atol=0)  # y[k] is measured before u[k] is applied
     torch.testing.assert_close(log.t, 0.5 * torch.arange(7, dtype=torch.float64))
     assert (log.y_ref == Y_REF).all() and log.y_ref.shape == (7, 4) and log.p.shape == (7, 3, 4) and not log.p.any()
-    assert log.status.tolist() == [0] * 7
+    assert log.status.tolist() == [0] * 7 and log.replanned.tolist() == [k % 2 == 0 for k in range(7)]
 
 
 @pytest.mark.parametrize("replan_every", [1, 4, 6])

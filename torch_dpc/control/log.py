@@ -22,6 +22,7 @@ class ClosedLoopLog:
         y_ref: the reference, `(*batch, steps, n_y)`.
         p: what was added to y_ini at the plan in force, `(*batch, steps, t_ini, n_y)`.
         status: of the plan in force, a :class:`torch_dpc.Status`, `(*batch, steps)`.
+        replanned: whether the plan in force was made at this step, boolean, `(*batch, steps)`.
 
     `log[i]` is one run of a batch.
     """
@@ -32,6 +33,7 @@ class ClosedLoopLog:
     y_ref: Tensor
     p: Tensor
     status: Tensor
+    replanned: Tensor
 
     @property
     def batch(self) -> torch.Size:
@@ -65,9 +67,13 @@ class ClosedLoopLog:
         return self._with(lambda x: x.detach())
 
     def to(self, *args: Any, **kwargs: Any) -> ClosedLoopLog:
-        """Return the log on another device or in another precision, as :meth:`torch.Tensor.to`; status stays int64."""
-        moved = self._with(lambda x: x.to(*args, **kwargs))
-        return replace(moved, t=self.t.to(*args, **kwargs), status=self.status.to(moved.u.device))
+        """Return the log on another device or in another precision, like :meth:`torch.Tensor.to`.
+
+        The precision of `status` and `replanned` stays.
+        """
+        t = self.t.to(*args, **kwargs)
+        moved = self._with(lambda x: x.to(t) if x.is_floating_point() else x.to(t.device))
+        return replace(moved, t=t)
 
     def summary(self) -> RunSummary:
         """Return tracking errors, inputs, perturbations and failures in a few numbers a run."""

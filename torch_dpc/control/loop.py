@@ -62,16 +62,18 @@ class Loop:
         self.p = torch.zeros(*self.batch, self.data.t_ini, self.data.n_y, dtype=torch.float64)
 
     def advance(self, steps: Iterable[int], progress: Callable[[int], None] | None = None) -> tuple[Tensor, ...]:
-        """Make some steps and return u, y, p and status of each, with the time before their own dimensions."""
-        us, ys, ps, statuses = [], [], [], []
+        """Make some steps and return u, y, p, status and replanned, with the time before their own dimensions."""
+        us, ys, ps, statuses, replanned = [], [], [], [], []
         for k in steps:
             ys.append(self.y)
+            replanned.append(torch.tensor(self.controller.replans_now).expand(self.batch))
             us.append(self._step(k))
             ps.append(self.p)
             statuses.append(torch.as_tensor(self.controller.status))
             if progress is not None:
                 progress(1)
-        return torch.stack(us, -2), torch.stack(ys, -2), torch.stack(ps, -3), torch.stack(statuses, -1)
+        per_step = ((us, -2), (ys, -2), (ps, -3), (statuses, -1), (replanned, -1))
+        return tuple(torch.stack(values, dim) for values, dim in per_step)
 
     def _step(self, k: int) -> Tensor:
         """Make step k and return the inputs that were applied."""

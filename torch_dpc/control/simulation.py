@@ -95,9 +95,9 @@ def simulate(
     loop.warm_up(_with_batch(plant, reset, batch), per_input("u_warmup", u_warmup, data.n_u))
     _check_batches(loop, batch)
     if checkpoint_every is None:
-        u, y, p, status = loop.advance(range(steps), progress)
+        u, y, p, status, replanned = loop.advance(range(steps), progress)
     else:
-        u, y, p, status = advance_with_checkpoints(
+        u, y, p, status, replanned = advance_with_checkpoints(
             loop, steps, check_count("checkpoint_every", checkpoint_every), progress
         )
     return ClosedLoopLog(
@@ -107,6 +107,7 @@ def simulate(
         y_ref=y_refs[..., :steps, :].expand(y.shape),
         p=p,
         status=status,
+        replanned=replanned,
     )
 
 

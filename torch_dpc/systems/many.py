@@ -22,8 +22,8 @@ class Many:
     Args:
         plants: one for each run. With `processes`, functions without arguments that make them, each called in its
             process; a class will do, or a `functools.partial`.
-        processes: step the plants in so many processes. This pays where a step takes much longer than 0.1 ms, the time
-            of a message to a process and back, as in PyBullet.
+        processes: step the plants in so many processes. This pays where cores are idle and a step takes much longer
+            than 0.1 ms, the time of a message to a process and back.
 
     Attributes:
         plants: the plants; empty with `processes`.
