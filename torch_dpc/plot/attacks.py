@@ -20,6 +20,7 @@ def damage(
     ylabel: str = "damage",
     xlabel: str = r"size of the attack, $\rho$",
     relative: bool = True,
+    unit: str = "runs",
 ) -> Figure:
     """Draw damage against the size of the attack, a curve for each attack.
 
@@ -31,6 +32,7 @@ def damage(
         axes: one axes; by default a new figure.
         ylabel, xlabel: what is drawn, with units.
         relative: sizes are fractions and are shown in percent.
+        unit: what the several values at one size are taken over.
 
     Returns:
         The figure.
@@ -60,8 +62,8 @@ def damage(
     if relative:
         one.xaxis.set_major_formatter(FuncFormatter(lambda size, _: f"{100 * size:.4g} %"))
     if max(counts) > 1:
-        runs_label = f"{max(counts)} runs" if len(counts) == 1 else f"{min(counts)} to {max(counts)} runs"
-        one.set_title(f"median and 10 to 90 % of {runs_label}")
+        number = f"{max(counts)}" if len(counts) == 1 else f"{min(counts)} to {max(counts)}"
+        one.set_title(f"median and 10 to 90 % of {number} {unit}")
     one.legend()
     return figure
 
