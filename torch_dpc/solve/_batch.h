@@ -6,7 +6,7 @@
 #ifndef TORCH_DPC_BATCH_H
 #define TORCH_DPC_BATCH_H
 
-#include "_newton.h"
+#include "_solution.h"
 
 #if !defined(_WIN32)
 #define HAS_THREADS 1
@@ -42,11 +42,15 @@ typedef struct {
     BatchSets sets;
     Numbers v0;                  /* solve */
     Numbers rhs;                 /* solve_active, solve_held */
-    Numbers v, lam;              /* solve_held: the solution */
+    Numbers v, lam;              /* solve_held: the solution; judge: lam */
+    Numbers raw;                 /* judge: v0 - G lam */
     Numbers v_bar, lam_bar;      /* adjoint; lam_bar may be missing, and is then zero */
     const unsigned char *active; /* (count, n): solve_active, adjoint */
     const unsigned char *weak;   /* (count, n): solve_held */
-    double *result;              /* (count, n): lam, the solution, or the adjoint */
+    double *result;              /* (count, n): lam, the solution, the adjoint, or v */
+    double *missed;              /* (count, n): judge */
+    unsigned char *is_weak, *is_active; /* (count, n): judge */
+    int64_t *counts;             /* (count, 2): judge */
     int64_t *iterations;         /* (count), or NULL */
     unsigned char *succeeded;    /* (count) */
 } Batch;
@@ -106,6 +110,18 @@ INLINE void solve_held_sample(const Batch *b, Workspace *w, int64_t i) {
     for (int64_t j = 0; b->succeeded[i] && j < held.rows; j++) result[w->rows[j]] = w->x[j];
 }
 
+INLINE void judge_sample(const Batch *b, Workspace *w, int64_t i) {
+    const Intervals intervals = intervals_of_sample(b, i);
+    b->succeeded[i] = (unsigned char)reserve_curved(w);
+    if (!b->succeeded[i]) return;
+    prepare(&intervals, w);
+    const Sets sets = sets_of_sample(b, w, i);
+    scale_multipliers(&sets, w);
+    const int64_t at = i * b->n;
+    const Verdict verdict = {b->result + at, b->missed + at, b->is_weak + at, b->is_active + at, b->counts + 2 * i};
+    judge(&sets, w, of_sample(&b->raw, i), of_sample(&b->lam, i), b->settings->weakness, &verdict);
+}
+
 INLINE int64_t list_active(const Batch *b, Workspace *w, int64_t i) {
     int64_t k = 0;
     for (int64_t j = 0; j < b->n; j++)
@@ -150,6 +166,7 @@ typedef void Work(const Batch *, Workspace *, int64_t from, int64_t to);
 #define ENTRY_POINTS(instructions, attribute)                                  \
     FOR_SAMPLES(solve_##instructions, solve_sample, attribute)                 \
     FOR_SAMPLES(solve_held_##instructions, solve_held_sample, attribute)       \
+    FOR_SAMPLES(judge_##instructions, judge_sample, attribute)                 \
     FOR_SAMPLES(solve_active_##instructions, solve_active_sample, attribute)   \
     FOR_SAMPLES(adjoint_##instructions, adjoint_sample, attribute)
 
@@ -158,7 +175,7 @@ ENTRY_POINTS(any, )
 ENTRY_POINTS(avx2, __attribute__((target("avx2,fma"))))
 #endif
 
-static Work *solve_work = solve_any, *solve_held_work = solve_held_any;
+static Work *solve_work = solve_any, *solve_held_work = solve_held_any, *judge_work = judge_any;
 static Work *solve_active_work = solve_active_any, *adjoint_work = adjoint_any;
 static const char *instructions = "any";
 
@@ -166,7 +183,7 @@ static void choose_instructions(void) {
 #if defined(__x86_64__)
     __builtin_cpu_init();
     if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma")) return;
-    solve_work = solve_avx2, solve_held_work = solve_held_avx2;
+    solve_work = solve_avx2, solve_held_work = solve_held_avx2, judge_work = judge_avx2;
     solve_active_work = solve_active_avx2, adjoint_work = adjoint_avx2;
     instructions = "avx2";
 #endif

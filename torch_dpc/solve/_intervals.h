@@ -86,7 +86,7 @@ INLINE void coordinate_descent(const Intervals *p, Workspace *w, int sweeps) {
 INLINE int classify_hard(const Workspace *w, int64_t *side, const int64_t *before) {
     mask differ = {0};
     for (int64_t i = 0; i < w->n; i += WIDTH) {
-        const vec pushed = load(w->v + i) + load(w->lam + i);
+        const vec pushed = load(w->v + i) + load(w->diagonal + i) * load(w->lam + i);
         const mask now = (mask)(pushed < load(w->below + i)) - (mask)(pushed > load(w->above + i));
         mask old;
         memcpy(&old, before + i, sizeof old);

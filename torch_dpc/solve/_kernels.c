@@ -3,6 +3,7 @@
  *     solve_boxes   lam with  v = v0 - G lam,  v - Proj(v + lam) = 0,  the projection on a box
  *     solve_sets    the same for priced intervals, balls and cones
  *     solve_held    W (W'G W + diag curvature)^-1 W' rhs, W the directions that the sets hold at a solution
+ *     judge_sets    what the sets say of multipliers: v, its distance from them, weak and active rows
  *     solve_active  s_A = G_AA^-1 rhs_A, zero elsewhere
  *     adjoint       v_bar + s,  s_A = G_AA^-1 (lam_bar - G v_bar)_A
  *
@@ -16,6 +17,7 @@
  *     _held.h       the system on the directions that they hold
  *     _intervals.h  the solve of one sample for intervals
  *     _newton.h     and for all sets
+ *     _solution.h   and what the sets say of it
  *     _batch.h      batches and threads
  *     here          arguments
  */
@@ -85,12 +87,20 @@ static int take_rows(
     return 1;
 }
 
-/* Take an array to write to, `(count, n)`. */
-static int take_result(Buffers *b, PyObject *object, const char *name, Batch *batch) {
-    const Py_buffer *view = take(b, object, name, 'd', PyBUF_WRITABLE);
+/* Take an array to write to, `(count, width)`. */
+static int take_table(
+    Buffers *b, PyObject *object, const char *name, char type, const Batch *batch, int64_t width, void **table) {
+    const Py_buffer *view = take(b, object, name, type, PyBUF_WRITABLE);
     if (!view) return 0;
-    if (view->ndim != 2 || view->shape[0] != batch->count || view->shape[1] != batch->n) return misfit(name);
-    batch->result = view->buf;
+    if (view->ndim != 2 || view->shape[0] != batch->count || view->shape[1] != width) return misfit(name);
+    *table = view->buf;
+    return 1;
+}
+
+static int take_result(Buffers *b, PyObject *object, const char *name, Batch *batch) {
+    void *table;
+    if (!take_table(b, object, name, 'd', batch, batch->n, &table)) return 0;
+    batch->result = table;
     return 1;
 }
 
@@ -192,14 +202,14 @@ static PyObject *settings(PyObject *self, PyObject *args, PyObject *keywords) {
     (void)self;
     static char *names[] = {"hysteresis", "independence", "touching", "primal_dual_steps", "converged", "good", "close",
                             "newton_steps", "halvings", "rounds", "patience", "inner_steps", "bisections", "growth",
-                            "largest_penalty", NULL};
+                            "largest_penalty", "weakness", NULL};
     double independence;
     Settings s;
     _Static_assert(sizeof(long long) == sizeof s.rounds, "the format L reads an int64_t");
     if (!PyArg_ParseTupleAndKeywords(
-            args, keywords, "$dddLdddLLLLLLdd", names, &s.hysteresis, &independence, &s.touching, &s.primal_dual_steps,
+            args, keywords, "$dddLdddLLLLLLddd", names, &s.hysteresis, &independence, &s.touching, &s.primal_dual_steps,
             &s.converged, &s.good, &s.close, &s.newton_steps, &s.halvings, &s.rounds, &s.patience, &s.inner_steps,
-            &s.bisections, &s.growth, &s.largest_penalty))
+            &s.bisections, &s.growth, &s.largest_penalty, &s.weakness))
         return NULL;
     s.least_pivot = independence * independence;
     Settings *made = malloc(sizeof *made);
@@ -279,6 +289,25 @@ static PyObject *solve_held_directions(PyObject *self, PyObject *const *args, Py
     return finish(&held, is_ready, &b, solve_held_work, threads);
 }
 
+static PyObject *judge_sets(PyObject *self, PyObject *const *args, Py_ssize_t count) {
+    (void)self;
+    Buffers held = {.count = 0};
+    Batch b = {0};
+    int64_t threads = 1;
+    void *missed = NULL, *is_weak = NULL, *is_active = NULL, *counts = NULL;
+    if (!has_arguments(count, 12)) return NULL;
+    const int is_ready =
+        take_problem(&held, args[0], args[2], "raw", &b, &b.raw) && take_sets(&held, args[1], &b) &&
+        take_rows(&held, args[3], "lam", &b, 0, b.n, &b.lam) && take_result(&held, args[4], "v", &b) &&
+        take_table(&held, args[5], "missed", 'd', &b, b.n, &missed) &&
+        take_table(&held, args[6], "weak", '?', &b, b.n, &is_weak) &&
+        take_table(&held, args[7], "active", '?', &b, b.n, &is_active) &&
+        take_table(&held, args[8], "counts", 'q', &b, 2, &counts) && take_succeeded(&held, args[9], "done", &b) &&
+        take_options(args + 10, &b, &threads);
+    b.missed = missed, b.is_weak = is_weak, b.is_active = is_active, b.counts = counts;
+    return finish(&held, is_ready, &b, judge_work, threads);
+}
+
 static PyObject *solve_active(PyObject *self, PyObject *const *args, Py_ssize_t count) {
     (void)self;
     Buffers held = {.count = 0};
@@ -317,6 +346,8 @@ static PyMethodDef methods[] = {
      "solve_sets(G, v0, sets, lam, iterations, converged, settings, threads)"},
     {"solve_held", FUNCTION(solve_held_directions), METH_FASTCALL,
      "solve_held(G, sets, v, lam, weak, rhs, out, trusted, settings, threads)"},
+    {"judge_sets", FUNCTION(judge_sets), METH_FASTCALL,
+     "judge_sets(G, sets, raw, lam, v, missed, weak, active, counts, done, settings, threads)"},
     {"solve_active", FUNCTION(solve_active), METH_FASTCALL,
      "solve_active(G, active, rhs, out, trusted, settings, threads)"},
     {"adjoint", FUNCTION(adjoint), METH_FASTCALL,

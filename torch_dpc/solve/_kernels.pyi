@@ -43,6 +43,21 @@ def solve_held(
     threads: int,
     /,
 ) -> None: ...
+def judge_sets(
+    G: ndarray,
+    sets: tuple[ndarray | None, ...],
+    raw: ndarray,
+    lam: ndarray,
+    v: ndarray,
+    missed: ndarray,
+    weak: ndarray,
+    active: ndarray,
+    counts: ndarray,
+    done: ndarray,
+    settings: Any,
+    threads: int,
+    /,
+) -> None: ...
 def solve_active(
     G: ndarray, active: ndarray, rhs: ndarray, out: ndarray, trusted: ndarray, settings: Any, threads: int, /
 ) -> None: ...

@@ -74,27 +74,6 @@ INLINE Held list_held_at(const Problem *p, Workspace *w, const double *x, const 
     return list_blocks(sets, w, k);
 }
 
-/* List what is held at a solution, for derivatives: what is `weak` counts as free, a block if all of it is. */
-INLINE Held list_held_at_solution(
-    const Sets *sets, Workspace *w, const double *v, const double *lam, const unsigned char *weak) {
-    Curved *c = &w->curved;
-    int64_t k = 0;
-    for (int64_t i = 0; i < w->n; i++) {
-        const double price = sets->price[i];
-        c->pushed[i] = v[i] + c->gamma[i] * lam[i];
-        const double pull = fabs(c->pushed[i] - clip(c->pushed[i], sets->lower[i], sets->upper[i]));
-        const int is_point = price == INFINITY && sets->lower[i] == sets->upper[i];
-        if (!weak[i] && (is_point || (pull > 0.0 && pull <= c->gamma[i] * price))) w->rows[k++] = i;
-    }
-    block_states_at(sets, w, c->pushed, c->gamma);
-    for (int64_t b = 0; b < sets->blocks; b++) {
-        int is_weak = 1;
-        for (int64_t j = sets->start[b]; j < sets->start[b + 1]; j++) is_weak &= weak[sets->rows[j]];
-        if (is_weak) c->state[b] = OFF;
-    }
-    return list_blocks(sets, w, k);
-}
-
 /* An entry of the direction n of a ball, from the reflector (n + sign e_1) / sqrt(1 + |n_1|). */
 INLINE double normal_at(const Sets *sets, const Curved *c, int64_t block, int64_t place) {
     const int64_t first = sets->start[block];

@@ -20,6 +20,7 @@ typedef struct {
     int64_t bisections;        /* of one of them */
     double growth;             /* of the penalty from round to round */
     double largest_penalty;    /* gamma / reach */
+    double weakness;           /* displacements and distances up to this, relative to 1 + |v|, count as zero */
 } Settings;
 
 #endif

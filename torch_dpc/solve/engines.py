@@ -18,6 +18,7 @@ from ..autodiff import untransformed
 from ..problem.reduction import Reduction
 from ..sets.bounds import Bounds
 from ..sets.feasible import FeasibleSet
+from ..sets.values import values_of
 from . import kernels
 from .daqp import Daqp, solve_daqp
 from .newton import solve_newton
@@ -130,9 +131,31 @@ class Engines:
         return solve_daqp(self.reduction.G, self.reduction.Ct, v0, sets.lower, sets.upper, self.workspace)
 
     def newton(self, v0: Tensor, sets: Sets) -> Found:
-        """Solve by semismooth Newton."""
+        """Solve by semismooth Newton: compiled if there is a kernel for the sets, in torch what that leaves."""
         if isinstance(sets, Bounds):
             return solve_newton(self.reduction.G, self.reduction.Ct, v0, sets.lower, sets.upper)
+        batch = v0.shape[:-1]
+        values = values_of(sets, batch, v0.device)
+        if values is None or not kernels.has_kernel_for(v0, values):
+            return self._newton_in_torch(v0, sets)
+        G = self.reduction.G
+        flat_G = G if G.ndim == 2 else G.expand(*batch, *G.shape[-2:]).reshape(-1, *G.shape[-2:])
+        found = kernels.solve_sets(flat_G, v0.reshape(-1, v0.shape[-1]), values)
+        found = Found(found.lam.reshape(v0.shape), found.iterations.reshape(batch), found.converged.reshape(batch))
+        return found if bool(found.converged.all()) else self._completed(found, v0, sets)
+
+    def _completed(self, found: Found, v0: Tensor, sets: FeasibleSet) -> Found:
+        """Return what was found, with the torch engine's answer for the samples that had not converged."""
+        failed, gap = ~found.converged, torch.zeros_like(v0)
+        may_leave = self.reduction.G.ndim == v0.ndim == 2 and not sets.batch_shape  # then samples are taken one by one
+        retried = self._newton_in_torch(v0[failed] if may_leave else v0, sets)
+        pairs = ((found.lam, retried.lam), (found.iterations, retried.iterations), (found.converged, retried.converged))
+        for whole, part in (*pairs, (gap, retried.gap)):
+            assert part is not None
+            whole[failed] = part if may_leave else part[failed]
+        return Found(found.lam, found.iterations, found.converged, gap)
+
+    def _newton_in_torch(self, v0: Tensor, sets: FeasibleSet) -> Found:
         v0, inverse = v0[..., self.order], self.inverse
         may_split = self.reduction.G.ndim == v0.ndim == 2 and not sets.batch_shape
         parts = v0.split(CHOICE.chunk) if may_split else [v0]

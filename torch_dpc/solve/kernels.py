@@ -11,7 +11,7 @@ from __future__ import annotations
 import os
 from dataclasses import asdict, dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import torch
@@ -19,6 +19,7 @@ from torch import Tensor
 
 from ..sets.values import SetValues
 from .outcome import Found
+from .weakness import WEAKLY_ACTIVE
 
 try:
     if os.environ.get("TORCH_DPC_NO_KERNELS", "0") not in ("", "0"):
@@ -62,6 +63,8 @@ class KernelSettings:
     #: it rounding grows with the penalty.
     growth: float = 10.0
     largest_penalty: float = 1e7
+    #: Displacements and distances up to this, relative to 1 + |v|, count as zero.
+    weakness: float = WEAKLY_ACTIVE
 
     @cached_property
     def compiled(self) -> Any:
@@ -124,6 +127,36 @@ def solve_sets(G: Tensor, v0: Tensor, values: SetValues) -> Found:
     options = SETTINGS.compiled, torch.get_num_threads()
     _kernels.solve_sets(as_array(G), as_array(v0), set_arrays(values), lam, steps, converged, *options)
     return Found(*map(torch.from_numpy, (lam, steps, converged)))
+
+
+class Verdict(NamedTuple):
+    """What the sets say of multipliers.
+
+    Attributes:
+        v: the projection of v0 - G lam onto the sets, `(B, N)`.
+        missed: its distance from v0 - G lam, row by row, relative to 1 + |v|, `(B, N)`.
+        weak: the rows whose multiplier counts as zero, `(B, N)`, boolean.
+        active: the held rows, `(B, N)`, boolean; of a curved boundary, the first row of its block.
+        counts: held directions, and bounds that v touches with a multiplier of zero, `(B, 2)`, int64.
+    """
+
+    v: Tensor
+    missed: Tensor
+    weak: Tensor
+    active: Tensor
+    counts: Tensor
+
+
+def judge_sets(G: Tensor, raw: Tensor, lam: Tensor, values: SetValues) -> Verdict:
+    """Return what the sets say of multipliers lam `(B, N)`, given raw = v0 - G lam `(B, N)`."""
+    shape, count = raw.shape, len(raw)
+    flags = np.empty(shape, dtype=bool), np.empty(shape, dtype=bool)
+    results = np.empty(shape), np.empty(shape), *flags, np.empty((count, 2), dtype=np.int64)
+    done, options = np.empty(count, dtype=bool), (SETTINGS.compiled, torch.get_num_threads())
+    _kernels.judge_sets(as_array(G), set_arrays(values), as_array(raw), as_array(lam), *results, done, *options)
+    if not done.all():
+        raise MemoryError("no memory for the judgement of a plan.")
+    return Verdict(*map(torch.from_numpy, results))
 
 
 def adjoint_sets(
