@@ -12,6 +12,7 @@ import torch
 from torch import Tensor
 
 from torch_dpc import DPCLayer, DPCSolution, InfeasibleError, SolveError, SolveInfo, Status
+from torch_dpc.solve.recovery import Thunks
 
 from ._layer import Judge, theta_of
 from ._problem import QP, Call
@@ -115,7 +116,7 @@ class Baseline:
             y=shaped(y).to(dtype),
             info=PeerInfo(lambda: shaped(_table(self._judge, flat, v, lam, result)), result.message),
             lam=shaped(lam),
-            _make_g=lambda: shaped(qp.g(flat, result.z)).to(dtype),
+            _later=Thunks({"g": lambda: shaped(qp.g(flat, result.z)).to(dtype)}),
         )
 
     def _solve(self, call: Call) -> PeerResult:

@@ -25,6 +25,7 @@ from .settings import VALIDATORS, GivenWeights, Settings, Setup, check_choice
 from .solution import DPCSolution, solution_of
 from .solve.derivative import plan
 from .solve.engines import Sets
+from .solve.recovery import Recovery
 
 
 class DPCLayer(nn.Module):
@@ -233,7 +234,7 @@ class DPCLayer(nn.Module):
             one_batch([("the samples", theta.shape[:-1]), *factored.problem.batches, *batches])
         on_failure = self.on_failure if on_failure is None else check_choice("on_failure", on_failure)
         planned = plan(factored.solver, theta, factored.reduction, sets, on_failure)
-        return solution_of(planned, theta, sets, self.data, factored.reduction, factored.solver, dtype)
+        return solution_of(Recovery(self.data, factored.reduction, factored.solver, sets, dtype, theta, planned))
 
     def bounds(self, device: torch.device) -> tuple[Tensor, Tensor]:
         """Return the bounds of (u, y, du) flattened, `(N,)` or `(*batch, N)` each, float64, with their graph.

@@ -2,24 +2,20 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import contextlib
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass
 from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
+from torch.utils._pytree import register_pytree_node
 
 from . import plot
-from .autodiff import carries_derivative
-from .batching import times
-from .data.hankel import HankelData
-from .data.hankel_batch import HankelBatch
+from .autodiff import is_plain
 from .errors import Status
-from .problem.reduction import Reduction
-from .solve.engines import Sets
-from .solve.outcome import Planned
-from .solve.solver import Solver
+from .solve.recovery import NAMES, Later, Recovery, Thunks
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -71,14 +67,30 @@ class SolveInfo:
         """
         return self._make_nonsingular() & (self.status == Status.SOLVED)
 
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the numbers, `nonsingular` included, without a graph."""
+        table = self.table.detach()
+        try:
+            return SolveInfo, (table, self.is_selection, _Constant(self.nonsingular.detach()))
+        except NotImplementedError:
+            return SolveInfo, (table, self.is_selection, _Lost())
+
+    def __copy__(self) -> SolveInfo:
+        """Return a copy that shares everything."""
+        copied = SolveInfo(self.table, self.is_selection, self._make_nonsingular)
+        copied.__dict__.update(self.__dict__)
+        return copied
+
     def __repr__(self) -> str:
-        names = ("status", "iterations", "residual", "n_active", "n_weakly_active", "is_selection")
-        return f"SolveInfo({', '.join(f'{name}={getattr(self, name)}' for name in names)})"
+        return f"SolveInfo({_told(self)})"
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class DPCSolution:
     """The planned trajectory.
+
+    A plan is a pytree of tensors, so that `torch.vmap` may return it; it pickles, without its graph; `plan[3]` is one
+    sample of a batch, `plan[:2]` or `plan[mask]` some.
 
     Attributes:
         u: planned inputs, `(*batch, horizon, n_u)`, in the units of the data.
@@ -91,60 +103,196 @@ class DPCSolution:
     y: Tensor
     info: SolveInfo
     lam: Tensor
-    _make_g: Callable[[], Tensor]
+    _later: Later
 
     @cached_property
     def g(self) -> Tensor:
         """The combination of the recorded windows, `(*batch, n_g)`; computed when first asked for."""
-        return self._make_g()
+        return self._later.make("g")
+
+    @cached_property
+    def value(self) -> Tensor:
+        """The optimal cost, `(*batch,)`, the price of soft bounds included; NaN without a solution.
+
+        Its derivative is that of the envelope theorem. Computed when first asked for.
+        """
+        return self._later.make("value")
+
+    @cached_property
+    def slack(self) -> Tensor:
+        """The mismatch of the initial output, Yp g - y_ini, `(*batch, t_ini, n_y)`; computed when first asked for."""
+        return self._later.make("slack")
 
     def plot(self, axes: Any = None, **options: Any) -> Figure:
         """Draw the plan, with its past and the truth where they are given: :func:`torch_dpc.plot.plan`."""
         return plot.plan(self, axes, **options)
 
+    def __getitem__(self, index: Any) -> DPCSolution:
+        """Return some samples of a batch: `index` is what indexes the batch dimensions of a tensor.
+
+        Raises:
+            IndexError: the plan has no batch dimension, or no such sample.
+        """
+        if self.info.table.ndim == 1:
+            raise IndexError("the plan is of one sample without a batch dimension: there is nothing to index.")
+        if index is Ellipsis or isinstance(index, tuple) and any(part is Ellipsis for part in index):
+            raise IndexError("`...` would index the steps of the plan: index the batch dimensions alone.")
+        return self._changed(lambda x: x[index])
+
+    def __len__(self) -> int:
+        """Return the length of the first batch dimension."""
+        if self.info.table.ndim == 1:
+            raise TypeError("the plan is of one sample without a batch dimension: it has no length.")
+        return len(self.info.table)
+
+    def __iter__(self) -> Iterator[DPCSolution]:
+        """Return the plans of the first batch dimension, one by one."""
+        return (self[i] for i in range(len(self)))
+
     def sample(self, i: int) -> DPCSolution:
         """Return one sample of a batch."""
-        info = SolveInfo(self.info.table[i], self.info.is_selection, lambda: self.info.nonsingular[i])
-        return DPCSolution(self.u[i], self.y[i], info, self.lam[i], lambda: self.g[i])
+        return self[i]
+
+    def detach(self) -> DPCSolution:
+        """Return the same numbers without their graph."""
+        return self._changed(Tensor.detach)
+
+    def to(self, *args: Any, **options: Any) -> DPCSolution:
+        """Return the plan on another device or in another dtype, as `torch.Tensor.to`.
+
+        Multipliers and `info` keep their dtypes.
+        """
+        device = self.u.to(*args, **options).device
+        return self._changed(lambda x: x.to(*args, **options), lambda x: x.to(device))
+
+    def _changed(
+        self, change: Callable[[Tensor], Tensor], change_own: Callable[[Tensor], Tensor] | None = None
+    ) -> DPCSolution:
+        """Return the plan with every tensor changed, multipliers and `info` by `change_own` if that is given.
+
+        What is computed when asked for is changed then.
+        """
+        own = change if change_own is None else change_own
+        info = self.info
+        return DPCSolution(
+            change(self.u),
+            change(self.y),
+            SolveInfo(own(info.table), info.is_selection, lambda: own(info.nonsingular)),
+            own(self.lam),
+            Thunks({name: _Changed(self, name, change) for name in NAMES}),
+        )
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """Pickle the numbers, those computed when asked for included, without a graph."""
+        told = {}
+        for name in NAMES:
+            with contextlib.suppress(ValueError, NotImplementedError):  # g of compact data, for instance
+                told[name] = getattr(self, name).detach()
+        return _restored, (self.u.detach(), self.y.detach(), self.info, self.lam.detach(), told)
+
+    def __repr__(self) -> str:
+        return f"DPCSolution(u={_range(self.u)},\n    y={_range(self.y)},\n    {_told(self.info)})"
 
 
-def solution_of(
-    planned: Planned,
-    theta: Tensor,
-    sets: Sets,
-    data: HankelData | HankelBatch,
-    reduction: Reduction,
-    solver: Solver,
-    dtype: torch.dtype,
-) -> DPCSolution:
-    """Return what a call of the layer returns; g is computed from these arguments when first asked for."""
+@dataclass(frozen=True)
+class _Changed:
+    """A result of another plan, changed."""
+
+    plan: DPCSolution
+    name: str
+    change: Callable[[Tensor], Tensor]
+
+    def __call__(self) -> Tensor:
+        return self.change(getattr(self.plan, self.name))
+
+
+def solution_of(recovery: Recovery) -> DPCSolution:
+    """Return what a call of the layer returns."""
+    planned, dtype = recovery.planned, recovery.dtype
     is_double = dtype == torch.float64
     return DPCSolution(
-        u=planned.u if is_double else planned.u.to(dtype),
-        y=planned.y if is_double else planned.y.to(dtype),
-        info=SolveInfo(
-            planned.info, reduction.is_selection, lambda: _nonsingular(data, reduction, solver, theta, planned, sets)
-        ),
-        lam=planned.lam,
-        _make_g=lambda: _g(data, reduction, theta, planned.lam, planned.info).to(dtype),
+        planned.u if is_double else planned.u.to(dtype),
+        planned.y if is_double else planned.y.to(dtype),
+        SolveInfo(planned.info, recovery.reduction.is_selection, lambda: recovery.make("nonsingular")),
+        planned.lam,
+        recovery,
     )
 
 
-def _nonsingular(
-    data: HankelData | HankelBatch, reduction: Reduction, solver: Solver, theta: Tensor, planned: Planned, sets: Sets
-) -> Tensor:
-    with torch.no_grad():
-        # The part of g that the data do not see is fixed by lambda_g alone.
-        fixed = (solver.reduction.weights.lambda_g > 0) | data.spans_all.to(theta.device)
-        decided = solver.reduction.rows.Eq_range is None and not reduction.is_selection
-        return solver.independent(planned, sets) & fixed & decided
+# --- pickles, pytrees and words ---------------------------------------------------------------------------------------
 
 
-def _g(data: HankelData | HankelBatch, reduction: Reduction, theta: Tensor, lam: Tensor, info: Tensor) -> Tensor:
-    data.require_windows()
-    a = times(reduction.A_theta, theta) - times(reduction.A_lam, lam)
-    g = times(basis := data.basis.to(a.device), a)
-    if carries_derivative((reduction.rows.C,)):  # g = D^+ (D g), so that the data behind D are differentiated too
-        D = data.stacked.to(a.device)
-        g = times(torch.linalg.pinv(D, rtol=1e-10), times(D @ basis, a))
-    return torch.where(info[..., :1] == Status.SOLVED, g, torch.nan)
+def _restored(u: Tensor, y: Tensor, info: SolveInfo, lam: Tensor, told: dict[str, Tensor]) -> DPCSolution:
+    why = "it was not available when the plan was pickled"
+    return DPCSolution(u, y, info, lam, Thunks({name: _Constant(value) for name, value in told.items()}, why))
+
+
+@dataclass(frozen=True, eq=False)
+class _Constant:
+    """A function of no argument."""
+
+    value: Tensor
+
+    def __call__(self) -> Tensor:
+        return self.value
+
+
+@dataclass(frozen=True, eq=False)
+class _Lost:
+    """`nonsingular` of an info that was taken apart or pickled before it was asked for."""
+
+    def __call__(self) -> Tensor:
+        raise NotImplementedError("`nonsingular` was not computed before the plan was taken apart: ask for it earlier.")
+
+
+def _flatten(plan: DPCSolution) -> tuple[list[Any], tuple[bool, Later]]:
+    children = [plan.u, plan.y, plan.info.table, plan.lam, *plan._later.tensors]
+    return children, (plan.info.is_selection, plan._later)
+
+
+def _unflatten(children: Iterable[Any], context: tuple[bool, Later]) -> DPCSolution:
+    u, y, table, lam, *own = children
+    later = context[1].with_tensors(own)
+    return DPCSolution(u, y, SolveInfo(table, context[0], lambda: later.make("nonsingular")), lam, later)
+
+
+def _flatten_info(info: SolveInfo) -> tuple[list[Any], bool]:
+    return [info.table], info.is_selection
+
+
+def _unflatten_info(children: Iterable[Any], is_selection: bool) -> SolveInfo:
+    (table,) = children
+    return SolveInfo(table, is_selection, _Lost())
+
+
+register_pytree_node(DPCSolution, _flatten, _unflatten, serialized_type_name="torch_dpc.DPCSolution")
+register_pytree_node(SolveInfo, _flatten_info, _unflatten_info, serialized_type_name="torch_dpc.SolveInfo")
+
+
+def _range(x: Tensor) -> str:
+    """Return shape and range of a tensor, in words."""
+    shape = f"{tuple(x.shape)} {str(x.dtype).removeprefix('torch.')}"
+    if not is_plain(x) or not isinstance(x, Tensor) or x.numel() == 0:
+        return shape
+    finite = x.detach()[x.detach().isfinite()]
+    if finite.numel() == 0:
+        return f"{shape}, all NaN"
+    return f"{shape} in [{float(finite.min()):.4g}, {float(finite.max()):.4g}]"
+
+
+def _told(info: SolveInfo) -> str:
+    """Return how the solve went: status by name, and the ranges of the counts."""
+    if not is_plain(info.table) or info.table.numel() == 0:
+        return f"status={tuple(info.table.shape[:-1])}"
+    table = info.table.detach().reshape(-1, info.table.shape[-1])
+    statuses = [Status(int(s)).name for s in table[:, 0]]
+    counted = {name: statuses.count(name) for name in (status.name for status in Status) if name in statuses}
+    alone = info.table.ndim == 1
+    status = statuses[0] if alone else ", ".join(f"{count} {name}" for name, count in counted.items())
+    low, high = table[:, 3].min(), table[:, 3].max()
+    active = f"{int(low)}" if low == high else f"{int(low)} to {int(high)}"
+    weak = int(table[:, 4].max())
+    return (
+        f"status={status}, residual={'' if alone else 'at most '}{float(table[:, 2].max()):.1e}, "
+        f"n_active={active}, n_weakly_active={'' if alone or not weak else 'up to '}{weak}"
+    )

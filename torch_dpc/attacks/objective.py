@@ -13,6 +13,7 @@ from ..checks import as_data, last_rows, to_horizon
 from ..errors import Status
 from ..layer import DPCLayer
 from ..solution import DPCSolution, SolveInfo
+from ..solve.recovery import NAMES, Thunks
 from .base import Planner
 from .costs import bound
 
@@ -79,7 +80,7 @@ class Objective:
         solution = self.layer(u_ini, y_ini, **self._refs_of(of), on_failure="nan")
         if of is not None:
             solution = self._among_the_last(solution, of)
-        self._last = _detached(solution)
+        self._last = solution.detach()
         return torch.where(solution.info.status == Status.SOLVED, self._judged(solution), torch.inf)
 
     def gradient(self, p: Tensor, of: Tensor | None = None) -> tuple[Tensor, Tensor]:
@@ -122,7 +123,12 @@ class Objective:
 
         info = SolveInfo(placed(part.info.table, last.info.table), part.info.is_selection, nonsingular)
         whole = {name: placed(getattr(part, name), getattr(last, name)) for name in ("u", "y", "lam")}
-        return replace(part, info=info, _make_g=lambda: placed(part.g, last.g), **whole)
+
+        def result(name: str) -> Callable[[], Tensor]:
+            return lambda: placed(getattr(part, name), getattr(last, name))
+
+        later = Thunks({name: result(name) for name in NAMES})
+        return replace(part, info=info, _later=later, **whole)
 
 
 def is_everyone(of: Tensor | None) -> bool:
@@ -154,8 +160,3 @@ def _reference(name: str, value: Any, horizon: int | None, batch: torch.Size) ->
     tensor = as_data(name, value)
     tensor = tensor if horizon is None else to_horizon(tensor, horizon)
     return tensor if tensor.ndim <= 2 else _of_batch(name, tensor, batch)
-
-
-def _detached(solution: DPCSolution) -> DPCSolution:
-    info = SolveInfo(solution.info.table.detach(), solution.info.is_selection, lambda: solution.info.nonsingular)
-    return replace(solution, u=solution.u.detach(), y=solution.y.detach(), lam=solution.lam.detach(), info=info)

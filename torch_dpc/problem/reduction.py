@@ -208,7 +208,7 @@ def _with_graph(reduction: Reduction) -> tuple[Tensor, Tensor]:
             terms.append(((weight @ block).mT, block, term.reference))
     for fit in rows.fits:
         terms.append((2 * getattr(weights, fit.weight)[..., None, None] * fit.rows.mT, fit.rows, fit.measured))
-    Psi = 2 * weights.lambda_g[..., None, None] * _gram_of_charged(rows)
+    Psi = 2 * weights.lambda_g[..., None, None] * gram_of_charged(rows)
     for weighted, block, _ in terms:
         Psi = Psi + weighted @ block
     batch = Psi.shape[:-2]
@@ -226,7 +226,7 @@ def _with_graph(reduction: Reduction) -> tuple[Tensor, Tensor]:
     return solution[..., : rows.n_theta], -solution[..., rows.n_theta :]
 
 
-def _gram_of_charged(rows: DataRows) -> Tensor:
+def gram_of_charged(rows: DataRows) -> Tensor:
     """M = I - W^+ W in the coordinates a (or I), with its derivative at constant rank of W where W has a graph."""
     N = _charged(rows)
     M = N.mT @ N

@@ -25,6 +25,7 @@ _FOLLOWING = (
     "jacobian_product",
     "minimize_linear",
     "support",
+    "conjugate",
     "bounded_direction",
     "slack",
     "is_point",
@@ -106,6 +107,19 @@ class ConvexSet(nn.Module):
         """Return the supremum over the set of <d, x>, for d `(..., n)`; it may be infinite."""
         best = self.minimize_linear(-d)
         return torch.where(d == 0, 0.0, d * best).sum(-1)
+
+    def conjugate(self, lam: Tensor, v: Tensor) -> Tensor:
+        """Return h*(lam), the supremum of <lam, v> over the set, at an optimal pair, `(...)`.
+
+        For a penalty in place of a set h*(lam) is the supremum of <lam, v> minus the penalty.
+
+        Args:
+            lam: multipliers, `(..., n)`.
+            v: the point of the set that they belong to, `(..., n)`.
+        """
+        if type(self).prox is not ConvexSet.prox:
+            raise NotImplementedError(f"{type(self).__name__} defines `prox`, but not `conjugate`: no optimal cost.")
+        return (lam * v).sum(-1)
 
     def bounded_direction(self, d: Tensor) -> Tensor:
         """Return a direction near d, `(..., n)`, in which the set is bounded; d itself where every direction is."""

@@ -54,3 +54,8 @@ class Bounds:
     def bounded_direction(self, d: Tensor) -> Tensor:
         """Return d `(..., N)` with zero where it points to a missing bound."""
         return torch.where(torch.where(d > 0, self.upper, self.lower).isfinite(), d, 0.0)
+
+    def conjugate(self, lam: Tensor, v: Tensor) -> Tensor:
+        """Return the supremum of <lam, v> over the box at optimal multipliers, `(...)`."""
+        bound = torch.where(lam < 0, self.lower, torch.where(lam > 0, self.upper, 0.0))
+        return (lam * bound).sum(-1)

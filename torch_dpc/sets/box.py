@@ -100,6 +100,10 @@ class Box(ConvexSet):
         anywhere = torch.minimum(torch.maximum(torch.zeros_like(c), lower), upper)  # where c = 0 any point will do
         return torch.where(c > 0, lower.expand_as(c), torch.where(c < 0, upper.expand_as(c), anywhere))
 
+    def conjugate(self, lam: Tensor, v: Tensor) -> Tensor:
+        lower, upper = self.bounds(lam)
+        return (lam * torch.where(lam < 0, lower, torch.where(lam > 0, upper, 0.0))).sum(-1)
+
     def slack(self, x: Tensor) -> Tensor:
         lower, upper = self.bounds(x)
         return torch.minimum(x - lower, upper - x)
@@ -203,6 +207,10 @@ class SoftBox(ConvexSet):
 
     def support(self, d: Tensor) -> Tensor:
         return torch.where(d == 0, torch.zeros_like(d), math.inf).sum(-1)  # no point is out of the question
+
+    def conjugate(self, lam: Tensor, v: Tensor) -> Tensor:
+        # Beyond the bound lam is the price itself: the product of price and distance cancels in <lam, v> - penalty.
+        return self.box.conjugate(lam, v)
 
     def bounded_direction(self, d: Tensor) -> Tensor:
         return torch.zeros_like(d)

@@ -82,6 +82,12 @@ class Ball(ConvexSet):
         _, _, distance, radius = self._polar(x)
         return radius - distance
 
+    def conjugate(self, lam: Tensor, v: Tensor) -> Tensor:
+        center, _, _, radius = self._polar(v)
+        free = (lam == 0).all(-1, keepdim=True)  # the norm has no derivative there
+        norm = torch.linalg.vector_norm(torch.where(free, 1.0, lam), dim=-1, keepdim=True)
+        return (lam * center).sum(-1) + (radius * torch.where(free, 0.0, norm))[..., 0]
+
     def is_point(self, x: Tensor) -> Tensor:
         radius = self._polar(x)[-1]
         return (radius == 0).expand_as(x[..., :1])

@@ -270,6 +270,14 @@ class FeasibleSet:
         """Return the supremum of <d, v> over each group's set, `(..., groups of all parts)`; it may be infinite."""
         return _joined([owner.support(self._group(d, at, shape)) for owner, at, shape in self._slices])
 
+    def conjugate(self, lam: Tensor, v: Tensor) -> Tensor:
+        """Return the sum of the sets' conjugates at optimal multipliers, `(...)`; lam and v in the order of v."""
+        lam, v = lam[..., self.order.to(lam.device)], v[..., self.order.to(lam.device)]
+        each = (
+            owner.conjugate(self._group(lam, at, shape), self._group(v, at, shape)) for owner, at, shape in self._slices
+        )
+        return _joined(list(each)).sum(-1)
+
     def bounded_direction(self, d: Tensor) -> Tensor:
         """Return a direction near d in which the sets are bounded."""
         return _joined(
