@@ -207,6 +207,17 @@ def test_a_plan_is_a_pytree():
     assert isinstance(aux, dpc.DPCSolution) and losses.shape == y_ini.shape
 
 
+def test_a_log_is_a_pytree_and_pickles():
+    plant = dpc.systems.OscillatingMasses()
+    layer = small_layer()
+    log = dpc.simulate(plant, dpc.DPCController(layer, replan_every=3), torch.zeros(4), steps=4)
+    moved = pytree.tree_map(lambda x: x.clone(), log)
+    for found in (moved, pickle.loads(pickle.dumps(log)), log.detach()):
+        assert isinstance(found, dpc.ClosedLoopLog)
+        for name in ("t", "u", "y", "y_ref", "p", "status"):
+            assert torch.equal(getattr(found, name), getattr(log, name))
+
+
 def test_words():
     u_ini, y_ini = inputs()
     layer = small_layer(u_set=dpc.Box(-0.1, 0.1), on_failure="nan")

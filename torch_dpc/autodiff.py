@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+from collections.abc import Iterable
 from typing import Any
 
 import torch
 from torch import Tensor
 from torch.autograd import forward_ad
+from torch.utils._pytree import register_pytree_node
 
 # Not public, but stable since torch 2.0; without them every tensor is taken to be wrapped, which is slower and right.
 _functorch = getattr(torch._C, "_functorch", None)
@@ -96,3 +99,16 @@ def carries_derivative(values: tuple[Any, ...]) -> bool:
     if getattr(forward_ad, "_current_level", 0) < 0:  # no forward derivative is under way: spare the look at each
         return False
     return any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)
+
+
+def register_fields(cls: type[Any]) -> None:
+    """Make a dataclass of tensors, or of None, a pytree: what `vmap` and transforms may return."""
+    names = [field.name for field in dataclasses.fields(cls)]
+
+    def flatten(record: Any) -> tuple[list[Any], None]:
+        return [getattr(record, name) for name in names], None
+
+    def unflatten(children: Iterable[Any], _: None) -> Any:
+        return cls(*children)
+
+    register_pytree_node(cls, flatten, unflatten, serialized_type_name=f"torch_dpc.{cls.__name__}")

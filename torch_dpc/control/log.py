@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..autodiff import register_fields
 from ..errors import Status
 
 
@@ -128,6 +129,9 @@ class ClosedLoopLog:
             f"mean |y - y_ref| {float(summary.mean_error.mean()):.3g}, "
             f"{100 * float(summary.unsolved.mean()):.3g} % of the steps without a plan of their own)"
         )
+
+
+register_fields(ClosedLoopLog)
 
 
 @dataclass(frozen=True, eq=False)
