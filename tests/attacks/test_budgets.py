@@ -301,7 +301,9 @@ def test_a_bad_number_of_sensors_is_named(channels):
         attacks.SparseBall(channels, 0.1)
 
 
-@pytest.mark.parametrize("inner", [attacks.Box(0.1), attacks.SparseBall(1, 0.1), attacks.Ellipsoid(0.1), 0.1],
+@pytest.mark.parametrize(
+    "inner",
+    [attacks.Box(0.1), attacks.SparseBall(1, 0.1), attacks.Ellipsoid(0.1), 0.1],
     ids=["box", "sparse", "ellipsoid", "number"],
 )
 def test_what_has_no_radius_a_channel_is_refused(inner):

@@ -13,6 +13,7 @@ from .budgets import (
     SparseBallBudget,
 )
 from .costs import Cost, TargetInput, TrackingError
+from .exact import WorstCase, worst_case
 from .gradient import FrankWolfeAttack, LinearizedAttack, ProjectedGradientAttack
 from .policy import AttackPolicy, PolicyAttack
 from .query import FiniteDifferenceAttack, RandomSearchAttack
@@ -53,4 +54,6 @@ __all__ = [
     "SparseBallBudget",
     "TargetInput",
     "TrackingError",
+    "WorstCase",
+    "worst_case",
 ]

@@ -49,13 +49,15 @@ class TargetInput:
         """Return the cost of a plan made at a step of the run."""
 
         def psi(solution: DPCSolution) -> Tensor:
-            target = self.target.to(solution.u)
-            if self.moves:
-                target = target[min(step, len(target) - 1) :]
-            target = to_horizon(target, solution.u.shape[-2])
+            target = self.rows_at(step, solution.u.shape[-2]).to(solution.u)
             return 0.5 * (solution.u - target).square().sum((-2, -1))
 
         return psi
+
+    def rows_at(self, step: int, horizon: int) -> Tensor:
+        """Return the inputs wanted of a plan made at a step, `(horizon, n_u)`, or `(n_u,)` for all of its steps."""
+        target = self.target[min(step, len(self.target) - 1) :] if self.moves else self.target
+        return to_horizon(target, horizon)
 
     def __call__(self, solution: DPCSolution) -> Tensor:
         """Return psi of a plan made at step 0, `(*batch,)`."""

@@ -2,12 +2,28 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, NamedTuple
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from ... import batching
+
+
+class NormBound(NamedTuple):
+    """|matrix p + offset| <= radius, Euclidean; one row is an interval.
+
+    Attributes:
+        matrix: `(k, t_ini n_y)`, float64; p is flattened, time-major.
+        offset: `(k,)`.
+        radius: not negative.
+    """
+
+    matrix: NDArray[np.float64]
+    offset: NDArray[np.float64]
+    radius: float
 
 
 class Budget:
@@ -30,6 +46,17 @@ class Budget:
     def random(self, y_ini: Tensor, generator: Any = None) -> Tensor:
         """Return a random perturbation that spends the whole budget."""
         return self.minimize_linear(-standard_normal(y_ini, generator), y_ini)
+
+    def norm_bounds(self, y_ini: Tensor) -> list[NormBound]:
+        """Return pieces whose intersection is the set, for one window `(t_ini, n_y)`.
+
+        Raises:
+            ValueError: the set has no such form.
+        """
+        raise ValueError(
+            f"{type(self).__name__} is no intersection of Euclidean norm bounds: take a BallBudget, BoxBudget, "
+            "EllipsoidBudget or PerChannelBudget of balls."
+        )
 
     def __repr__(self) -> str:
         fields = ", ".join(f"{name}={_shown(value)}" for name, value in vars(self).items())
@@ -60,6 +87,17 @@ def direction(c: Tensor) -> Tensor:
 def ratio(size: Tensor, reach: Tensor) -> Tensor:
     """Return size / reach: 0 where the size is 0, infinity where a size meets no reach."""
     return torch.where(size > 0, size / reach, 0.0)
+
+
+def norm_bound(scale: Tensor) -> list[NormBound]:
+    """Return sum (p_i / scale_i)^2 <= 1 as pieces; an entry with scale 0 is an interval of radius 0."""
+    reach = scale.detach().double().flatten().cpu().numpy()
+    rows = np.eye(len(reach))
+    free = reach > 0
+    pieces = [NormBound(rows[i : i + 1], np.zeros(1), 0.0) for i in np.flatnonzero(~free)]
+    if free.any():
+        pieces.append(NormBound(rows[free] / reach[free, None], np.zeros(int(free.sum())), 1.0))
+    return pieces
 
 
 def nonnegative(name: str, value: Any) -> Tensor:

@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from .base import Budget, direction, euclidean, nonnegative, ratio
+from .base import Budget, NormBound, direction, euclidean, nonnegative, norm_bound, ratio
 
 
 class BoxBudget(Budget):
@@ -32,6 +33,11 @@ class BoxBudget(Budget):
 
     def excess(self, p: Tensor, y_ini: Tensor) -> Tensor:
         return ratio(p.abs(), self._reach(y_ini)).amax((-2, -1)) - 1
+
+    def norm_bounds(self, y_ini: Tensor) -> list[NormBound]:
+        reach = self._reach(y_ini.double()).expand(y_ini.shape).flatten().tolist()
+        rows = np.eye(len(reach))
+        return [NormBound(rows[i : i + 1], np.zeros(1), radius) for i, radius in enumerate(reach)]
 
     def _reach(self, y_ini: Tensor) -> Tensor:
         radius = self.radius.to(y_ini)
@@ -74,6 +80,9 @@ class EllipsoidBudget(Budget):
 
     def excess(self, p: Tensor, y_ini: Tensor) -> Tensor:
         return euclidean(ratio(p.abs(), self._reach(y_ini)))[..., 0, 0] - 1
+
+    def norm_bounds(self, y_ini: Tensor) -> list[NormBound]:
+        return norm_bound(self._reach(y_ini.double()).expand(y_ini.shape))
 
     def _reach(self, y_ini: Tensor) -> Tensor:
         scale = self.scale.to(y_ini)

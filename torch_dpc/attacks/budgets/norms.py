@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
-from .base import Budget, direction, euclidean, nonnegative, ratio, standard_normal
+from .base import Budget, NormBound, direction, euclidean, nonnegative, norm_bound, ratio, standard_normal
 
 
 class NormBall(Budget):
@@ -54,6 +55,9 @@ class BallBudget(NormBall):
 
     def project(self, p: Tensor, y_ini: Tensor) -> Tensor:
         return p * _shrink(euclidean(p), self._reach(y_ini))
+
+    def norm_bounds(self, y_ini: Tensor) -> list[NormBound]:
+        return norm_bound(self._reach(y_ini.double()).expand(y_ini.shape))
 
 
 class RelativeBallBudget(BallBudget):
@@ -141,6 +145,9 @@ class SparseBallBudget(BallBudget):
         touched = (p != 0).any(-2).sum(-1)
         return torch.where(touched > self.channels, torch.inf, super().excess(p, y_ini))
 
+    def norm_bounds(self, y_ini: Tensor) -> list[NormBound]:
+        return Budget.norm_bounds(self, y_ini)  # a union of balls is no intersection
+
     def _keep_largest(self, p: Tensor) -> Tensor:
         size = torch.linalg.vector_norm(p, dim=-2, keepdim=True)
         chosen = size.topk(min(self.channels, p.shape[-1]), dim=-1).indices
@@ -178,6 +185,23 @@ class PerChannelBudget(Budget):
 
     def excess(self, p: Tensor, y_ini: Tensor) -> Tensor:
         return self.budget.excess(_split(p), _split(y_ini)).amax(-1)
+
+    def norm_bounds(self, y_ini: Tensor) -> list[NormBound]:
+        if not isinstance(self.budget, BallBudget):
+            return super().norm_bounds(y_ini)
+        # The reach of each channel, `(n_y,)`; every channel is a ball over its own entries.
+        reach = self.budget._reach(_split(y_ini.double())).flatten().expand(y_ini.shape[-1])
+        pieces: list[NormBound] = []
+        for channel in range(y_ini.shape[-1]):
+            own = torch.zeros(y_ini.shape, dtype=torch.float64)
+            own[:, channel] = 1.0
+            rows = np.diag(own.flatten().numpy())[own.flatten().numpy() > 0]
+            radius = float(reach[channel])
+            if radius == 0.0:
+                pieces += [NormBound(row[None], np.zeros(1), 0.0) for row in rows]
+            else:
+                pieces.append(NormBound(rows, np.zeros(len(rows)), radius))
+        return pieces
 
 
 def _split(p: Tensor) -> Tensor:
