@@ -113,7 +113,7 @@ def test_intervals_hold_every_plan():
     layer = small_layer()
     u_ini, y_ini = (w[0] for w in windows(1, 3, seed=5, scale=0.3))
     budget, data, reduction = attacks.Ball(0.2), layer.data, layer.reduction
-    theta, _ = layer.flatten(u_ini, y_ini, Y_REF, HOLDING)
+    theta, _ = layer.flatten(u_ini, y_ini, REFS["y_ref"], REFS["u_ref"])
     Vp = reduction.V[:, 6:18].numpy()
     of_s = in_few_variables(Vp, budget.norm_bounds(y_ini))
     nominal = layer(u_ini, y_ini, **REFS).lam.numpy()
