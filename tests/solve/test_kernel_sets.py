@@ -65,10 +65,23 @@ class Problem:
         bounds = torch.from_numpy(self.lower), torch.from_numpy(self.upper), price
         return SetValues(*bounds, *integers, torch.from_numpy(center), torch.tensor(self.radius, dtype=torch.float64))
 
+    @property
+    def gamma(self):
+        """The scale of multipliers that the kernel has: the diagonal of G, the largest of each block."""
+        gamma = self.G.diagonal().copy()
+        gamma = np.maximum(gamma, 1e-6 * gamma.max())
+        for block in self.blocks:
+            gamma[block] = gamma[block].max()
+        return gamma
+
     def prox(self, x):
         """The proximal map with gamma = 1."""
+        return self.prox_in(x, np.ones(self.n))
+
+    def prox_in(self, x, gamma):
         pull = x - np.clip(x, self.lower, self.upper)
-        out = x - np.clip(pull, -self.price, self.price)
+        with np.errstate(invalid="ignore"):
+            out = x - np.clip(pull, -gamma * self.price, gamma * self.price)
         for kind, block, center, radius in zip(self.kind, self.blocks, self.center, self.radius, strict=True):
             part = x[..., block]
             if kind == BALL:
@@ -198,6 +211,81 @@ def test_a_value_that_is_not_finite_flags_its_sample_alone():
     problem.v0[1, 0] = np.nan
     _, converged = problem.solve()
     assert converged.tolist() == [True, False, True]
+
+
+# --- the judgement, and whole calls -----------------------------------------------------------------------------------
+
+
+def whole(problem):
+    """A map in units for the problem, theta, and the sets in those units."""
+    random, n_theta = np.random.default_rng(1), problem.n + 2
+    V = random.standard_normal((problem.n, n_theta))
+    unit = 2.0 ** np.repeat(random.integers(-6, 6, 1), problem.n)
+    theta = np.linalg.lstsq(V, problem.v0.T, rcond=None)[0].T
+    of = kernels.Map(problem.G, V, np.ones(n_theta), problem.G.diagonal().copy(), unit, 1e-15, 1e-16)
+    return of, kernels.set_arrays(problem.values), np.ascontiguousarray(theta)
+
+
+@pytest.mark.parametrize("seed", range(6))
+@pytest.mark.parametrize("mixture", ["all", "balls", "cones", "priced"])
+def test_the_judgement_against_projections(mixture, seed):
+    problem = Problem(seed, **MIXTURES[mixture])
+    lam, _ = problem.solve()
+    for multipliers in (lam, lam + 1e-3, 0 * lam):
+        raw = problem.v_of(multipliers)
+        verdict = kernels.judge_sets(*map(torch.from_numpy, (problem.G, raw, multipliers)), problem.values)
+        gamma = problem.gamma
+        v = problem.prox_in(raw + gamma * multipliers, gamma)
+        np.testing.assert_allclose(verdict.v, v, atol=1e-12)
+        size = np.abs(v)
+        for block in problem.blocks:
+            size[:, block] = size[:, block].max(1, keepdims=True)
+        np.testing.assert_allclose(verdict.missed, np.abs(raw - v) / (1 + size), atol=1e-12)
+        small = np.abs(multipliers * problem.G.diagonal()) <= 1e-9 * (1 + np.abs(v))
+        for block in problem.blocks:
+            small[:, block] = small[:, block].all(1, keepdims=True)
+        assert np.array_equal(verdict.weak, small)
+        assert np.array_equal(verdict.counts[:, 0], verdict.active.sum(1))
+        assert not (verdict.active & verdict.weak).any()
+    assert verdict.missed.max() > 1e-3  # the multipliers of the last round are none
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("mixture", ["all", "priced", "cones"])
+def test_a_whole_call_is_its_parts(mixture, seed):
+    problem = Problem(seed, n_x=7, **MIXTURES[mixture])
+    of, sets, theta = whole(problem)
+    found = kernels.plan(of, sets, theta)
+    v0 = theta @ of.V.T
+    again = kernels.plan(of, sets, theta, v0)
+    lam, converged = problem.solve(v0)
+    assert converged.all() and (found.info[:, 0] == 0).all()
+    raw = problem.v_of(lam, v0)
+    verdict = kernels.judge_sets(*map(torch.from_numpy, (problem.G, raw, lam)), problem.values)
+    for of_call in (found, again):
+        np.testing.assert_allclose(of_call.v, verdict.v.numpy() * of.unit, rtol=1e-9, atol=1e-10)
+        np.testing.assert_allclose(of_call.info[:, 3:], verdict.counts)
+    errors = 1e-15 * np.abs(theta).max(1) + 1e-16 * (np.abs(again.lam * of.unit) * of.moved).sum(1)
+    missed = np.abs(raw - verdict.v.numpy()).max(1)
+    assert (again.info[:, 2] >= errors).all() and (again.info[:, 2] <= missed + errors + 1e-12).all()
+    bar, lam_bar = randn(*found.v.shape, seed=1).numpy(), randn(*found.v.shape, seed=2).numpy()
+    at = found.v, found.lam, found.weak
+    result = kernels.plan_adjoint(of, sets, at, bar, lam_bar, of_theta=True)
+    assert result is not None
+    rhs = lam_bar / of.unit - (bar * of.unit) @ of.G
+    in_units = (torch.from_numpy(x) for x in (of.G, found.v / of.unit, found.lam * of.unit, found.weak))
+    moved, _ = kernels.adjoint_sets(*in_units, problem.values, torch.from_numpy(rhs))
+    expected = bar + moved.numpy() / of.unit
+    np.testing.assert_allclose(result[0], expected, rtol=1e-9, atol=1e-10)
+    np.testing.assert_allclose(result[1], (expected * of.unit) @ of.V, rtol=1e-9, atol=1e-9)
+
+
+def test_a_plan_without_a_solution_is_marked():
+    problem = Problem(4, kinds=(), prices=0.0)
+    of, sets, theta = whole(problem)
+    theta[1, 0] = np.nan
+    found = kernels.plan(of, sets, theta)
+    assert found.info[1, 0] == 2 and (found.info[[0, 2], 0] == 0).all()
 
 
 @pytest.mark.parametrize(

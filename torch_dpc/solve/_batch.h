@@ -34,13 +34,25 @@ typedef struct {
     const int64_t *kind, *start, *rows;
 } BatchSets;
 
+/* The reduced problem, with rows of v in units of their own: v = V theta - G lam. One for all samples. */
+typedef struct {
+    int64_t n_theta;
+    const double *V;                     /* (n, n_theta) */
+    const double *per_theta;             /* (n_theta): theta in units */
+    const double *moved;                 /* (n): G_ii, and what the error of the map is relative to */
+    const double *unit;                  /* (n): of v, powers of two */
+    double error_of_theta, error_of_lam; /* of a row of v, relative to theta and to lam in units */
+} Map;
+
 /* The arguments of every entry point; what one does not take stays empty. */
 typedef struct {
     int64_t count, n;
     Numbers G;
     const Settings *settings;
     BatchSets sets;
-    Numbers v0;                  /* solve */
+    Map map;                     /* plan, plan_adjoint */
+    Numbers theta;               /* (count, n_theta): plan */
+    Numbers v0;                  /* solve, plan; the latter computes it if it is missing */
     Numbers rhs;                 /* solve_active, solve_held */
     Numbers v, lam;              /* solve_held: the solution; judge: lam */
     Numbers raw;                 /* judge: v0 - G lam */
@@ -49,7 +61,10 @@ typedef struct {
     const unsigned char *weak;   /* (count, n): solve_held */
     double *result;              /* (count, n): lam, the solution, the adjoint, or v */
     double *missed;              /* (count, n): judge */
-    unsigned char *is_weak, *is_active; /* (count, n): judge */
+    unsigned char *is_weak, *is_active; /* (count, n): judge, plan */
+    double *result_lam;          /* (count, n): plan */
+    double *info;                /* (count, 5): plan; status, iterations, residual, both counts */
+    double *theta_bar;           /* (count, n_theta), or NULL: plan_adjoint */
     int64_t *counts;             /* (count, 2): judge */
     int64_t *iterations;         /* (count), or NULL */
     unsigned char *succeeded;    /* (count) */
@@ -81,15 +96,19 @@ INLINE Sets sets_of_sample(const Batch *b, const Workspace *w, int64_t i) {
     };
 }
 
+/* Leave lam in the workspace; return whether it is the solution. */
+INLINE int solve_one(const Batch *b, Workspace *w, int64_t i, const double *v0, int64_t *iterations) {
+    Intervals intervals = intervals_of_sample(b, i);
+    intervals.v0 = v0;
+    if (b->sets.blocks == 0 && solve_intervals(&intervals, w, iterations)) return 1;
+    if (b->sets.blocks == 0 && !intervals.price) return 0;
+    prepare(&intervals, w);
+    const Sets sets = sets_of_sample(b, w, i);
+    return solve_curved(&(Problem){intervals.G, v0, &sets, b->settings}, w, iterations);
+}
+
 INLINE void solve_sample(const Batch *b, Workspace *w, int64_t i) {
-    const Intervals intervals = intervals_of_sample(b, i);
-    int solved = b->sets.blocks == 0 && solve_intervals(&intervals, w, b->iterations + i);
-    if (!solved && (b->sets.blocks > 0 || intervals.price)) {
-        prepare(&intervals, w);
-        const Sets sets = sets_of_sample(b, w, i);
-        solved = solve_curved(&(Problem){intervals.G, intervals.v0, &sets, b->settings}, w, b->iterations + i);
-    }
-    b->succeeded[i] = (unsigned char)solved;
+    b->succeeded[i] = (unsigned char)solve_one(b, w, i, of_sample(&b->v0, i), b->iterations + i);
     memcpy(b->result + i * b->n, w->lam, bytes(b->n));
 }
 
@@ -120,6 +139,78 @@ INLINE void judge_sample(const Batch *b, Workspace *w, int64_t i) {
     const int64_t at = i * b->n;
     const Verdict verdict = {b->result + at, b->missed + at, b->is_weak + at, b->is_active + at, b->counts + 2 * i};
     judge(&sets, w, of_sample(&b->raw, i), of_sample(&b->lam, i), b->settings->weakness, &verdict);
+}
+
+enum { INFO = 5 };                  /* columns of `info` */
+enum { SOLVED = 0, FAILED = 2 }; /* its status, as torch_dpc.Status has it */
+
+/* Solve one sample and judge it: everything of a plan but a certificate. */
+INLINE void plan_sample(const Batch *b, Workspace *w, int64_t i) {
+    const Map *map = &b->map;
+    const int64_t n = b->n, at = i * n;
+    const double *theta = of_sample(&b->theta, i), *v0 = of_sample(&b->v0, i), *G = of_sample(&b->G, i);
+    double *info = b->info + INFO * i, largest = 0.0, error, missed = 0.0;
+    int64_t iterations = 0, counts[2];
+    b->succeeded[i] = (unsigned char)reserve_curved(w);
+    if (!b->succeeded[i]) return;
+    if (!v0) {
+        for (int64_t j = 0; j < n; j++) w->v0[j] = dot(map->V + j * map->n_theta, theta, map->n_theta);
+        v0 = w->v0;
+    }
+    const int solved = solve_one(b, w, i, v0, &iterations);
+    const Intervals intervals = intervals_of_sample(b, i);
+    prepare(&intervals, w);
+    const Sets sets = sets_of_sample(b, w, i);
+    scale_multipliers(&sets, w);
+    subtract_product(&(Problem){G, v0, &sets, b->settings}, w, w->v, v0, w->lam);
+    const Verdict verdict = {b->result + at, w->curved.trial, b->is_weak + at, b->is_active + at, counts};
+    judge(&sets, w, w->v, w->lam, b->settings->weakness, &verdict);
+    for (int64_t j = 0; j < map->n_theta; j++) largest = fmax(largest, fabs(theta[j] * map->per_theta[j]));
+    error = map->error_of_theta * largest;
+    for (int64_t j = 0; j < n; j++) {
+        missed = !(w->curved.trial[j] <= missed) ? w->curved.trial[j] : missed; /* NaN stays */
+        error += map->error_of_lam * fabs(w->lam[j]) * map->moved[j];
+        b->result[at + j] *= map->unit[j];
+        b->result_lam[at + j] = w->lam[j] / map->unit[j];
+    }
+    info[0] = solved && missed + error <= b->settings->accepted ? SOLVED : FAILED;
+    info[1] = (double)iterations;
+    info[2] = missed + error;
+    info[3] = (double)counts[0], info[4] = (double)counts[1];
+}
+
+/* v0_bar = v_bar + S (lam_bar - G v_bar), and theta_bar = V' v0_bar; see `solve_held_sample` for S. */
+INLINE void plan_adjoint_sample(const Batch *b, Workspace *w, int64_t i) {
+    const Map *map = &b->map;
+    const int64_t n = b->n;
+    const Intervals intervals = intervals_of_sample(b, i);
+    const double *G = intervals.G, *v = of_sample(&b->v, i), *lam = of_sample(&b->lam, i);
+    const double *v_bar = of_sample(&b->v_bar, i), *lam_bar = of_sample(&b->lam_bar, i);
+    double *v0_bar = b->result + i * n;
+    b->succeeded[i] = 0;
+    if (!reserve_curved(w)) return;
+    prepare(&intervals, w);
+    const Sets sets = sets_of_sample(b, w, i);
+    scale_multipliers(&sets, w);
+    double *v_units = w->curved.trial, *lam_units = w->curved.target, *bar = w->curved.v_trial;
+    for (int64_t j = 0; j < n; j++) {
+        v_units[j] = v[j] / map->unit[j], lam_units[j] = lam[j] * map->unit[j];
+        bar[j] = v_bar[j] * map->unit[j];
+    }
+    const Held held = list_held_at_solution(&sets, w, v_units, lam_units, b->weak + i * n);
+    for (int64_t j = 0; j < held.rows; j++) {
+        const int64_t row = w->rows[j];
+        w->rhs[row] = (lam_bar ? lam_bar[row] / map->unit[row] : 0.0) - dot(G + row * n, bar, n);
+    }
+    if (!solve_held(&sets, w, G, NULL, held, b->settings->least_pivot)) return;
+    b->succeeded[i] = 1;
+    for (int64_t j = 0; j < held.rows; j++) bar[w->rows[j]] += w->x[j];
+    for (int64_t j = 0; j < n; j++) v0_bar[j] = bar[j] / map->unit[j];
+    if (!b->theta_bar) return;
+    double *theta_bar = b->theta_bar + i * map->n_theta;
+    memset(theta_bar, 0, bytes(map->n_theta));
+    for (int64_t j = 0; j < n; j++)
+        if (bar[j] != 0.0) subtract_scaled(theta_bar, -bar[j], map->V + j * map->n_theta, map->n_theta);
 }
 
 INLINE int64_t list_active(const Batch *b, Workspace *w, int64_t i) {
@@ -167,6 +258,8 @@ typedef void Work(const Batch *, Workspace *, int64_t from, int64_t to);
     FOR_SAMPLES(solve_##instructions, solve_sample, attribute)                 \
     FOR_SAMPLES(solve_held_##instructions, solve_held_sample, attribute)       \
     FOR_SAMPLES(judge_##instructions, judge_sample, attribute)                 \
+    FOR_SAMPLES(plan_##instructions, plan_sample, attribute)                   \
+    FOR_SAMPLES(plan_adjoint_##instructions, plan_adjoint_sample, attribute)   \
     FOR_SAMPLES(solve_active_##instructions, solve_active_sample, attribute)   \
     FOR_SAMPLES(adjoint_##instructions, adjoint_sample, attribute)
 
@@ -176,6 +269,7 @@ ENTRY_POINTS(avx2, __attribute__((target("avx2,fma"))))
 #endif
 
 static Work *solve_work = solve_any, *solve_held_work = solve_held_any, *judge_work = judge_any;
+static Work *plan_work = plan_any, *plan_adjoint_work = plan_adjoint_any;
 static Work *solve_active_work = solve_active_any, *adjoint_work = adjoint_any;
 static const char *instructions = "any";
 
@@ -184,6 +278,7 @@ static void choose_instructions(void) {
     __builtin_cpu_init();
     if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma")) return;
     solve_work = solve_avx2, solve_held_work = solve_held_avx2, judge_work = judge_avx2;
+    plan_work = plan_avx2, plan_adjoint_work = plan_adjoint_avx2;
     solve_active_work = solve_active_avx2, adjoint_work = adjoint_avx2;
     instructions = "avx2";
 #endif

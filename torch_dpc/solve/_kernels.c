@@ -3,6 +3,8 @@
  *     solve_boxes   lam with  v = v0 - G lam,  v - Proj(v + lam) = 0,  the projection on a box
  *     solve_sets    the same for priced intervals, balls and cones
  *     solve_held    W (W'G W + diag curvature)^-1 W' rhs, W the directions that the sets hold at a solution
+ *     plan          the whole of a small call: v0 = V theta, lam, v, and the residual
+ *     plan_adjoint  and of its backward: V'(v_bar + S (lam_bar - G v_bar)), S as in solve_held
  *     judge_sets    what the sets say of multipliers: v, its distance from them, weak and active rows
  *     solve_active  s_A = G_AA^-1 rhs_A, zero elsewhere
  *     adjoint       v_bar + s,  s_A = G_AA^-1 (lam_bar - G v_bar)_A
@@ -28,7 +30,7 @@
 
 /* --- arguments ---------------------------------------------------------------------------------------------------- */
 
-enum { MAX_BUFFERS = 16 };
+enum { MAX_BUFFERS = 24 };
 
 typedef struct {
     Py_buffer views[MAX_BUFFERS];
@@ -186,6 +188,38 @@ static int take_sets(Buffers *b, PyObject *object, Batch *batch) {
     return are_unbounded(batch, count) || misfit("lower");
 }
 
+/* Take an array `(rows, columns)`, or `(columns,)` if rows is 0. */
+static int take_constant(
+    Buffers *b, PyObject *object, const char *name, int64_t rows, int64_t columns, const double **data) {
+    const Py_buffer *view = take(b, object, name, 'd', 0);
+    if (!view) return 0;
+    if (view->ndim != 1 + (rows > 0) || view->shape[view->ndim - 1] != columns) return misfit(name);
+    if (rows > 0 && view->shape[0] != rows) return misfit(name);
+    *data = view->buf;
+    return 1;
+}
+
+/* Take the tuple (G, V, per_theta, moved, unit, error_of_theta, error_of_lam) and vectors `(count, n)` that say what n
+ * is, which is above 0. */
+static int take_map(Buffers *b, PyObject *object, int64_t count, int64_t n, Batch *batch) {
+    Map *map = &batch->map;
+    if (!PyTuple_Check(object) || PyTuple_GET_SIZE(object) != 7) return misfit("map");
+    PyObject *const *parts = PySequence_Fast_ITEMS(object);
+    batch->count = count, batch->n = n;
+    const double *G;
+    const Py_buffer *V = take(b, parts[1], "V", 'd', 0);
+    if (!V) return 0;
+    if (V->ndim != 2 || V->shape[0] != n || n < 1) return misfit("V");
+    map->V = V->buf, map->n_theta = V->shape[1];
+    if (!take_constant(b, parts[0], "G", n, n, &G)) return 0;
+    batch->G = (Numbers){G, 0};
+    if (!take_constant(b, parts[2], "per_theta", 0, map->n_theta, &map->per_theta)) return 0;
+    if (!take_constant(b, parts[3], "moved", 0, n, &map->moved)) return 0;
+    if (!take_constant(b, parts[4], "unit", 0, n, &map->unit)) return 0;
+    map->error_of_theta = PyFloat_AsDouble(parts[5]), map->error_of_lam = PyFloat_AsDouble(parts[6]);
+    return !PyErr_Occurred();
+}
+
 static int has_arguments(Py_ssize_t got, Py_ssize_t expected) {
     if (got == expected) return 1;
     PyErr_Format(PyExc_TypeError, "expected %zd arguments, got %zd.", expected, got);
@@ -202,14 +236,14 @@ static PyObject *settings(PyObject *self, PyObject *args, PyObject *keywords) {
     (void)self;
     static char *names[] = {"hysteresis", "independence", "touching", "primal_dual_steps", "converged", "good", "close",
                             "newton_steps", "halvings", "rounds", "patience", "inner_steps", "bisections", "growth",
-                            "largest_penalty", "weakness", NULL};
+                            "largest_penalty", "weakness", "accepted", NULL};
     double independence;
     Settings s;
     _Static_assert(sizeof(long long) == sizeof s.rounds, "the format L reads an int64_t");
     if (!PyArg_ParseTupleAndKeywords(
-            args, keywords, "$dddLdddLLLLLLddd", names, &s.hysteresis, &independence, &s.touching, &s.primal_dual_steps,
+            args, keywords, "$dddLdddLLLLLLdddd", names, &s.hysteresis, &independence, &s.touching, &s.primal_dual_steps,
             &s.converged, &s.good, &s.close, &s.newton_steps, &s.halvings, &s.rounds, &s.patience, &s.inner_steps,
-            &s.bisections, &s.growth, &s.largest_penalty, &s.weakness))
+            &s.bisections, &s.growth, &s.largest_penalty, &s.weakness, &s.accepted))
         return NULL;
     s.least_pivot = independence * independence;
     Settings *made = malloc(sizeof *made);
@@ -308,6 +342,56 @@ static PyObject *judge_sets(PyObject *self, PyObject *const *args, Py_ssize_t co
     return finish(&held, is_ready, &b, judge_work, threads);
 }
 
+/* Take vectors `(count, width)` that are read first, and say what count and width are. */
+static const Py_buffer *take_first(Buffers *b, PyObject *object, const char *name) {
+    const Py_buffer *view = take(b, object, name, 'd', 0);
+    if (view && view->ndim != 2) return misfit(name), NULL;
+    return view;
+}
+
+static PyObject *plan(PyObject *self, PyObject *const *args, Py_ssize_t count) {
+    (void)self;
+    Buffers held = {.count = 0};
+    Batch b = {0};
+    int64_t threads = 1;
+    void *lam = NULL, *is_active = NULL, *is_weak = NULL, *info = NULL;
+    if (!has_arguments(count, 12)) return NULL;
+    const Py_buffer *theta = take_first(&held, args[2], "theta"), *v = NULL;
+    int is_ready = theta && (v = take(&held, args[4], "v", 'd', PyBUF_WRITABLE)) != NULL;
+    if (is_ready) is_ready = (v->ndim == 2 && v->shape[0] == theta->shape[0]) || misfit("v");
+    is_ready = is_ready && take_map(&held, args[0], v->shape[0], v->shape[1], &b) && take_sets(&held, args[1], &b) &&
+               (theta->shape[1] == b.map.n_theta || misfit("theta")) &&
+               (args[3] == Py_None || take_rows(&held, args[3], "v0", &b, 0, b.n, &b.v0)) &&
+               take_table(&held, args[5], "lam", 'd', &b, b.n, &lam) &&
+               take_table(&held, args[6], "active", '?', &b, b.n, &is_active) &&
+               take_table(&held, args[7], "weak", '?', &b, b.n, &is_weak) &&
+               take_table(&held, args[8], "info", 'd', &b, INFO, &info) &&
+               take_succeeded(&held, args[9], "done", &b) && take_options(args + 10, &b, &threads);
+    if (is_ready) b.theta = (Numbers){theta->buf, b.map.n_theta}, b.result = v->buf;
+    b.result_lam = lam, b.is_active = is_active, b.is_weak = is_weak, b.info = info;
+    return finish(&held, is_ready, &b, plan_work, threads);
+}
+
+static PyObject *plan_adjoint(PyObject *self, PyObject *const *args, Py_ssize_t count) {
+    (void)self;
+    Buffers held = {.count = 0};
+    Batch b = {0};
+    int64_t threads = 1;
+    void *theta_bar = NULL;
+    if (!has_arguments(count, 12)) return NULL;
+    const Py_buffer *v_bar = take_first(&held, args[5], "v_bar");
+    const int is_ready =
+        v_bar && take_map(&held, args[0], v_bar->shape[0], v_bar->shape[1], &b) && take_sets(&held, args[1], &b) &&
+        take_rows(&held, args[2], "v", &b, 0, b.n, &b.v) && take_rows(&held, args[3], "lam", &b, 0, b.n, &b.lam) &&
+        take_flags(&held, args[4], "weak", &b, &b.weak) &&
+        (args[6] == Py_None || take_rows(&held, args[6], "lam_bar", &b, 0, b.n, &b.lam_bar)) &&
+        take_result(&held, args[7], "v0_bar", &b) &&
+        (args[8] == Py_None || take_table(&held, args[8], "theta_bar", 'd', &b, b.map.n_theta, &theta_bar)) &&
+        take_succeeded(&held, args[9], "trusted", &b) && take_options(args + 10, &b, &threads);
+    if (is_ready) b.v_bar = (Numbers){v_bar->buf, b.n}, b.theta_bar = theta_bar;
+    return finish(&held, is_ready, &b, plan_adjoint_work, threads);
+}
+
 static PyObject *solve_active(PyObject *self, PyObject *const *args, Py_ssize_t count) {
     (void)self;
     Buffers held = {.count = 0};
@@ -348,6 +432,10 @@ static PyMethodDef methods[] = {
      "solve_held(G, sets, v, lam, weak, rhs, out, trusted, settings, threads)"},
     {"judge_sets", FUNCTION(judge_sets), METH_FASTCALL,
      "judge_sets(G, sets, raw, lam, v, missed, weak, active, counts, done, settings, threads)"},
+    {"plan", FUNCTION(plan), METH_FASTCALL,
+     "plan(map, sets, theta, v0, v, lam, active, weak, info, done, settings, threads)"},
+    {"plan_adjoint", FUNCTION(plan_adjoint), METH_FASTCALL,
+     "plan_adjoint(map, sets, v, lam, weak, v_bar, lam_bar, v0_bar, theta_bar, trusted, settings, threads)"},
     {"solve_active", FUNCTION(solve_active), METH_FASTCALL,
      "solve_active(G, active, rhs, out, trusted, settings, threads)"},
     {"adjoint", FUNCTION(adjoint), METH_FASTCALL,

@@ -58,6 +58,36 @@ def judge_sets(
     threads: int,
     /,
 ) -> None: ...
+def plan(
+    map: tuple[Any, ...],
+    sets: tuple[ndarray | None, ...],
+    theta: ndarray,
+    v0: ndarray | None,
+    v: ndarray,
+    lam: ndarray,
+    active: ndarray,
+    weak: ndarray,
+    info: ndarray,
+    done: ndarray,
+    settings: Any,
+    threads: int,
+    /,
+) -> None: ...
+def plan_adjoint(
+    map: tuple[Any, ...],
+    sets: tuple[ndarray | None, ...],
+    v: ndarray,
+    lam: ndarray,
+    weak: ndarray,
+    v_bar: ndarray,
+    lam_bar: ndarray | None,
+    v0_bar: ndarray,
+    theta_bar: ndarray | None,
+    trusted: ndarray,
+    settings: Any,
+    threads: int,
+    /,
+) -> None: ...
 def solve_active(
     G: ndarray, active: ndarray, rhs: ndarray, out: ndarray, trusted: ndarray, settings: Any, threads: int, /
 ) -> None: ...

@@ -21,6 +21,7 @@ typedef struct {
     double growth;             /* of the penalty from round to round */
     double largest_penalty;    /* gamma / reach */
     double weakness;           /* displacements and distances up to this, relative to 1 + |v|, count as zero */
+    double accepted;           /* the residual of a plan that is accepted */
 } Settings;
 
 #endif

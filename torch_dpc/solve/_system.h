@@ -40,6 +40,7 @@ typedef struct {
     double *rhs;                     /* the right-hand side, by row of G */
     double *x;                       /* the solution, in the order of `rows` */
     double *v, *lam;                 /* the iterate */
+    double *v0;                      /* the unconstrained minimiser, if the kernel computes it */
     double *start;                   /* v0 less what the multipliers that are known take of it */
     double *lower, *upper, *price;   /* the intervals */
     double *below, *above;           /* what v + lam must pass for a row to be held at its bound */
@@ -53,7 +54,7 @@ typedef struct {
     Curved curved;
 } Workspace;
 
-enum { VECTORS = 20 }; /* of a workspace */
+enum { VECTORS = 21 }; /* of a workspace */
 
 static int64_t round_up(int64_t n, int64_t to) { return (n + to - 1) / to * to; }
 
@@ -84,7 +85,7 @@ static int new_workspace(Workspace *w, int64_t n) {
     if (!next) return 0;
     memset(next, 0, bytes(count));
     double **vectors[] = {&w->inverse_pivots, &w->rhs,   &w->x,   &w->v,      &w->lam,      &w->start, &w->lower, &w->upper,
-                          &w->price,          &w->below, &w->above, &w->top, &w->bottom, &w->diagonal, &w->inverse_diagonal};
+                          &w->price,          &w->below, &w->above, &w->top, &w->bottom, &w->diagonal, &w->inverse_diagonal, &w->v0};
     int64_t **integers[] = {&w->rows, &w->from_held, &w->side, &w->new_side, &w->skipped};
     for (size_t i = 0; i < sizeof vectors / sizeof *vectors; i++, next += width) *vectors[i] = next;
     for (size_t i = 0; i < sizeof integers / sizeof *integers; i++, next += width) *integers[i] = (int64_t *)(void *)next;

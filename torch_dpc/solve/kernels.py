@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from ..sets.values import SetValues
-from .outcome import Found
+from .outcome import ACCEPTANCE, Found
 from .weakness import WEAKLY_ACTIVE
 
 try:
@@ -65,6 +65,8 @@ class KernelSettings:
     largest_penalty: float = 1e7
     #: Displacements and distances up to this, relative to 1 + |v|, count as zero.
     weakness: float = WEAKLY_ACTIVE
+    #: Residual of an accepted plan.
+    accepted: float = ACCEPTANCE.residual
 
     @cached_property
     def compiled(self) -> Any:
@@ -73,6 +75,9 @@ class KernelSettings:
 
 
 SETTINGS = KernelSettings()
+
+#: Sets as the kernels read them.
+SetArrays = tuple[np.ndarray | None, ...]
 HYSTERESIS, STANDING_OUT = SETTINGS.hysteresis, SETTINGS.independence
 
 
@@ -159,6 +164,97 @@ def judge_sets(G: Tensor, raw: Tensor, lam: Tensor, values: SetValues) -> Verdic
     return Verdict(*map(torch.from_numpy, results))
 
 
+@dataclass(frozen=True, eq=False)
+class Map:
+    """The reduced problem  v = V theta - G lam  of all samples, with rows of v in units of their own; arrays.
+
+    Attributes:
+        G: `(N, N)`.
+        V: `(N, n_theta)`.
+        per_theta: 1 / the size of each entry of theta, `(n_theta,)`.
+        moved: what an error of the map is relative to for each unit of a multiplier, `(N,)`.
+        unit: of the rows of v, powers of two, `(N,)`.
+        error_of_theta, error_of_lam: bounds of the errors of the map, relative to both.
+    """
+
+    G: np.ndarray
+    V: np.ndarray
+    per_theta: np.ndarray
+    moved: np.ndarray
+    unit: np.ndarray
+    error_of_theta: float
+    error_of_lam: float
+
+    @cached_property
+    def arguments(self) -> tuple[Any, ...]:
+        """The same, as the kernels read it."""
+        arrays = (np.ascontiguousarray(x) for x in (self.G, self.V, self.per_theta, self.moved, self.unit))
+        return *arrays, self.error_of_theta, self.error_of_lam
+
+
+class PlannedArrays(NamedTuple):
+    """Plans as `plan` makes them: v, lam `(B, N)`; active, weak `(B, N)`, boolean; and info `(B, 5)`."""
+
+    v: np.ndarray
+    lam: np.ndarray
+    active: np.ndarray
+    weak: np.ndarray
+    info: np.ndarray
+
+
+def plan(of: Map, sets: SetArrays, theta: np.ndarray, v0: np.ndarray | None = None, threads: int = 1) -> PlannedArrays:
+    """Solve and judge every sample: everything of a plan but the certificate of one that has no solution.
+
+    Args:
+        of: the reduced problem.
+        sets: in units, from `set_arrays`.
+        theta: `(B, n_theta)`.
+        v0: V theta `(B, N)`, if it is known.
+        threads: the most to use.
+
+    Returns:
+        v and lam in the caller's units, and the judgement; `info` is that of :class:`torch_dpc.solve.outcome.Solved`.
+    """
+    shape, count = (len(theta), len(of.unit)), len(theta)
+    flags = np.empty(shape, dtype=bool), np.empty(shape, dtype=bool)
+    results = PlannedArrays(np.empty(shape), np.empty(shape), *flags, np.empty((count, 5)))
+    done = np.empty(count, dtype=bool)
+    _kernels.plan(of.arguments, sets, theta, v0, *results, done, SETTINGS.compiled, threads)
+    if not done.all():
+        raise MemoryError("no memory for a plan.")
+    return results
+
+
+def plan_adjoint(
+    of: Map,
+    sets: SetArrays,
+    at: tuple[np.ndarray, np.ndarray, np.ndarray],
+    v_bar: np.ndarray,
+    lam_bar: np.ndarray | None,
+    *,
+    of_theta: bool,
+    threads: int = 1,
+) -> tuple[np.ndarray, np.ndarray | None] | None:
+    """Return v0_bar = v_bar + S (lam_bar - G v_bar) `(B, N)`, and theta_bar = V' v0_bar `(B, n_theta)` if wanted.
+
+    Args:
+        of: the reduced problem.
+        sets: in units, from `set_arrays`.
+        at: v, lam and the weak rows of the plan, `(B, N)`.
+        v_bar, lam_bar: cotangents `(B, N)`, in the caller's units like v; lam_bar may be missing.
+        of_theta: whether theta_bar is wanted.
+        threads: the most to use.
+
+    Returns:
+        None if the held directions of a sample are dependent.
+    """
+    v0_bar, trusted = np.empty(v_bar.shape), np.empty(len(v_bar), dtype=bool)
+    theta_bar = np.empty((len(v_bar), len(of.per_theta))) if of_theta else None
+    options = SETTINGS.compiled, threads
+    _kernels.plan_adjoint(of.arguments, sets, *at, v_bar, lam_bar, v0_bar, theta_bar, trusted, *options)
+    return (v0_bar, theta_bar) if trusted.all() else None
+
+
 def adjoint_sets(
     G: Tensor, v: Tensor, lam: Tensor, weak: Tensor, values: SetValues, rhs: Tensor
 ) -> tuple[Tensor, Tensor]:
@@ -180,7 +276,7 @@ def adjoint_sets(
     return torch.from_numpy(out), torch.from_numpy(trusted)
 
 
-def set_arrays(values: SetValues) -> tuple[np.ndarray | None, ...]:
+def set_arrays(values: SetValues) -> SetArrays:
     """Return sets as the kernels read them: lower, upper, price, kind, start, rows, center, radius."""
     price = None if values.price is None else as_array(values.price)
     rest = values.kind, values.start, values.rows, values.center, values.radius
