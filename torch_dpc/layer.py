@@ -10,6 +10,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from .checkpoints import restore, state_of
 from .checks import one_batch, reference, window, with_one_batch
 from .data.hankel import HankelData
 from .data.hankel_batch import HankelBatch
@@ -309,6 +310,18 @@ class DPCLayer(nn.Module):
         """
         layer: DPCLayer = load_layer(cls, path)
         return layer
+
+    def get_extra_state(self) -> Tensor:
+        """Return what `state_dict` holds besides parameters: compact data, settings and sets, as bytes."""
+        return state_of(self)
+
+    def set_extra_state(self, state: Tensor) -> None:
+        """Take over data, settings and sets of a checkpoint, so that the layer plans like the one that was saved.
+
+        Raises:
+            ValueError: the checkpoint does not fit.
+        """
+        restore(self, state)
 
     def extra_repr(self) -> str:
         """Describe the data and the sizes of the systems that are solved."""

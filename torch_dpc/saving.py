@@ -43,20 +43,9 @@ ENTRIES = {"version", "data", "arguments", CHECKSUM}
 def save_layer(layer: nn.Module, path: str | os.PathLike[str], *, data: bool = False) -> None:
     """Write a layer; see :meth:`torch_dpc.DPCLayer.save`."""
     torch_files = _safetensors()
-    writer = _Writer()
-    layer.feasible_set  # noqa: B018  # settings that do not go together could not be loaded
-    held = layer.data
-    if not isinstance(held, HankelData):
-        raise ValueError("a layer on a batch of data sets cannot be saved: save one layer for each.")
-    if data:
-        held.require_windows()
-    text = {
-        "version": VERSION,
-        "data": _data_to_tree(held if data else held.compressed(), writer),
-        "arguments": {name: writer.tree(value, f"`{name}`", name) for name, value in arguments_of(layer).items()},
-    }
-    text[CHECKSUM] = _checksum(text, writer.tensors)
-    write_whole(path, torch_files.save(writer.tensors, metadata={HEADER: json.dumps(text, allow_nan=False)}))
+    text, tensors = layer_to_tree(layer, data=data)
+    text[CHECKSUM] = _checksum(text, tensors)
+    write_whole(path, torch_files.save(tensors, metadata={HEADER: json.dumps(text, allow_nan=False)}))
 
 
 def load_layer(cls: type[Any], path: str | os.PathLike[str]) -> Any:
@@ -70,12 +59,43 @@ def load_layer(cls: type[Any], path: str | os.PathLike[str]) -> Any:
     found = text.pop(CHECKSUM, None)
     if text.keys() - ENTRIES or (found is not None and found != _checksum(text, tensors)):
         raise ValueError(f"{os.fspath(path)!r} is damaged: its content does not agree with its checksum.")
-    reader = _Reader(tensors)
     try:
-        data = _data_from_tree(text["data"], reader)
-        return cls(data, **{name: reader.value(tree) for name, tree in text["arguments"].items()})
+        return layer_from_tree(cls, text, tensors)
     except (KeyError, TypeError, AttributeError, IndexError, RecursionError) as error:
         raise ValueError(f"{os.fspath(path)!r} is not a whole torch_dpc file: {error!r}.") from error
+
+
+def layer_to_tree(layer: Any, *, data: bool = False, live: bool = False) -> tuple[dict[str, Any], dict[str, Tensor]]:
+    """Return a layer as a tree of JSON and the tensors that it names.
+
+    Args:
+        layer: a `DPCLayer`.
+        data: with the recorded windows; otherwise the data are compact.
+        live: with the layer's own tensors in place of copies of their values.
+
+    Raises:
+        ValueError: a set that is not known, a batch of data sets, or settings that do not go together.
+    """
+    writer = _Writer(live=live)
+    layer.feasible_set  # noqa: B018  # settings that do not go together could not be loaded
+    held = layer.data
+    if not isinstance(held, HankelData):
+        raise ValueError("a layer on a batch of data sets cannot be saved: save one layer for each.")
+    if data:
+        held.require_windows()
+    text = {
+        "version": VERSION,
+        "data": _data_to_tree(held if data else held.compressed(), writer),
+        "arguments": {name: writer.tree(value, f"`{name}`", name) for name, value in arguments_of(layer).items()},
+    }
+    return text, writer.tensors
+
+
+def layer_from_tree(cls: type[Any], text: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Any:
+    """Return the layer of class `cls` that :func:`layer_to_tree` describes."""
+    reader = _Reader(dict(tensors))
+    data = _data_from_tree(text["data"], reader)
+    return cls(data, **{name: reader.value(tree) for name, tree in text["arguments"].items()})
 
 
 # --- data -------------------------------------------------------------------------------------------------------------
@@ -124,8 +144,9 @@ def _data_from_tree(tree: Mapping[str, Any], reader: _Reader) -> HankelData:
 class _Writer:
     """Values to a tree of JSON, and the tensors it names."""
 
-    def __init__(self) -> None:
+    def __init__(self, *, live: bool = False) -> None:
         self.tensors: dict[str, Tensor] = {}
+        self._live = live
         self._seen: dict[int, tuple[Any, dict[str, Any]]] = {}  # a parameter used twice stays one
 
     def tree(self, value: Any, what: str, key: str) -> Any:
@@ -159,7 +180,7 @@ class _Writer:
 
     def _tensor(self, tensor: Tensor, key: str) -> dict[str, Any]:
         if id(tensor) not in self._seen:
-            self.tensors[key] = _plain(tensor)
+            self.tensors[key] = tensor if self._live else _plain(tensor)
             learns = tensor.is_leaf and tensor.requires_grad  # what a graph made is kept as its value
             tree = {"tensor": key, "parameter": isinstance(tensor, nn.Parameter), "requires_grad": learns}
             self._seen[id(tensor)] = (tensor, tree)

@@ -69,7 +69,7 @@ class Problem:
         if self.terms != Terms():
             raise ValueError('backward="full" is the system of the paper\'s problem; use backward="reduced".')
         assert isinstance(self.data, HankelData)  # batches were refused with the batched reductions
-        return FullSystem(self.data, weights, self.sets.is_box)
+        return FullSystem(self.data, weights, self.sets.structure_key is None)
 
 
 def rows_of(data: HankelData | HankelBatch, device: torch.device, terms: Terms) -> DataRows:
