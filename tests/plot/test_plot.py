@@ -3,6 +3,7 @@
 import subprocess
 import sys
 import types
+from dataclasses import replace
 
 import matplotlib
 
@@ -42,12 +43,11 @@ def runs(layer):
     ]
 
 
-FIELDS = ("u", "y", "y_ref", "p", "status")
+FIELDS = ("u", "y", "y_ref", "p", "status", "replanned")
 
 
 def batch_of(logs):
-    stacked = {name: torch.stack([getattr(log, name) for log in logs]) for name in FIELDS}
-    return types.SimpleNamespace(t=logs[0].t, **stacked)
+    return dpc.ClosedLoopLog(logs[0].t, **{name: torch.stack([getattr(log, name) for log in logs]) for name in FIELDS})
 
 
 def line(axes, label):
@@ -65,7 +65,7 @@ def labels(axes):
 def test_a_run_is_drawn_channel_by_channel(runs, layer):
     log = runs[1][0]
     names = ["q1 [m]", "q2 [m]", "v1 [m/s]", "v2 [m/s]"]
-    axes = plot.log(log, layer=layer, y_names=names, u_names=["F1 [N]", "F2 [N]"]).axes
+    axes = log.plot(layer=layer, y_names=names, u_names=["F1 [N]", "F2 [N]"]).axes
     assert [one.get_ylabel() for one in axes] == [*names, "F1 [N]", "F2 [N]", "|p|"]
     for i in range(4):
         np.testing.assert_array_equal(line(axes[i], "output").get_xdata(), log.t)
@@ -90,16 +90,14 @@ def test_a_run_without_attack_has_no_panel_for_it(runs):
     figure = plot.log(runs[0])
     assert [one.get_ylabel() for one in figure.axes] == ["y0", "y1", "y2", "y3", "u0", "u1"]
     legend = [text.get_text() for text in figure.legends[0].get_texts()]
-    assert legend == ["reference", "output", "input"]
+    assert legend == ["reference", "output", "input", "plan made"]
 
 
 def test_steps_of_plans_are_marked(runs):
-    log = types.SimpleNamespace(t=runs[0].t, **{name: getattr(runs[0], name) for name in FIELDS})
-    log.replanned = torch.arange(12) % 3 == 0
-    for axes in plot.log(log).axes:
-        np.testing.assert_array_equal(line(axes, "plan made").get_xdata(), log.t[::3])
-    log.replanned = torch.ones(12, dtype=torch.bool)
-    assert "plan made" not in labels(plot.log(log).axes[0])
+    for axes in runs[0].plot().axes:
+        np.testing.assert_array_equal(line(axes, "plan made").get_xdata(), runs[0].t[::3])
+    every_step = replace(runs[0], replanned=torch.ones(12, dtype=torch.bool))
+    assert "plan made" not in labels(every_step.plot().axes[0])
 
 
 def test_few_runs_are_lines(runs):
@@ -111,9 +109,8 @@ def test_few_runs_are_lines(runs):
 
 
 def test_many_runs_are_median_and_band(runs):
-    log = batch_of(runs[1] * 5)
-    log.y = randn(15, 12, 4)
-    figure = plot.log(log)
+    log = replace(batch_of(runs[1] * 5), y=randn(15, 12, 4))
+    figure = log.plot()
     np.testing.assert_allclose(line(figure.axes[1], "output").get_ydata(), np.median(log.y[..., 1].numpy(), axis=0))
     (band,) = figure.axes[1].collections
     low, high = np.percentile(log.y[..., 1].numpy(), (10, 90), axis=0)
@@ -126,7 +123,7 @@ def test_many_runs_are_median_and_band(runs):
 def test_axes_in_figure_out(runs):
     own, grid = plt.subplots(2, 3)
     assert plot.log(runs[0], grid) is own
-    assert labels(grid[0, 0]) == ["reference", "output"]
+    assert labels(grid[0, 0]) == ["reference", "output", "plan made"]
     assert not own.legends
     with pytest.raises(ValueError, match="`axes` must be 6 matplotlib axes, got 1 of Axes"):
         plot.log(runs[0], grid[0, 0])

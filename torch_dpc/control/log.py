@@ -3,13 +3,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, fields, replace
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import torch
 from torch import Tensor
 
+from .. import plot
 from ..autodiff import register_fields
 from ..errors import Status
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,6 +92,10 @@ class ClosedLoopLog:
             largest_p=torch.linalg.vector_norm(self.p.detach().flatten(-2), dim=-1).amax(-1),
             unsolved=(self.status != Status.SOLVED).double().mean(-1),
         )
+
+    def plot(self, axes: Any = None, **options: Any) -> Figure:
+        """Draw the run, or the batch of runs, against time: :func:`torch_dpc.plot.log`."""
+        return plot.log(self, axes, **options)
 
     def to_pandas(self) -> Any:
         """Return a table with one row a step, indexed by time, or by (run, time) for a batch.

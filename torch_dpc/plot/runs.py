@@ -79,7 +79,7 @@ def log(
         all_axes[-1].set_ylabel("|p|")
         all_axes[-1].set_ylim(bottom=0)
     for one in all_axes:
-        _mark_plans(one, t, log)
+        _mark_plans(one, t, as_array(log.replanned))
     for one in (all_axes[n_y - 1], all_axes[-1]):
         one.set_xlabel("time [s]")
     if axes is None:
@@ -107,12 +107,9 @@ def _draw_reference(axes: Axes, t: Array, reference: Array) -> None:
     draw_runs(axes, t, flat[0] if shared else flat, color="black", linestyle="--", linewidth=1.0, label="reference")
 
 
-def _mark_plans(axes: Axes, t: Array, log: Any) -> None:
-    """Mark the steps at which plans were made, by ticks along the bottom; of a batch those of its first run."""
-    made = getattr(log, "replanned", None)
-    if made is None:
-        return
-    at = t[as_array(made).reshape(-1, len(t))[0] > 0]
+def _mark_plans(axes: Axes, t: Array, replanned: Array) -> None:
+    """Mark the steps at which plans were made, along the bottom; of a batch those of its first run."""
+    at = t[replanned.reshape(-1, len(t))[0] > 0]
     if len(at) < len(t):  # a plan at every step says nothing
         at_the_bottom = axes.get_xaxis_transform()
         axes.plot(at, 0 * at, "^", color=GREY, markersize=4, transform=at_the_bottom, label="plan made", clip_on=False)
