@@ -12,6 +12,7 @@ from .budgets import (
     RelativeBallBudget,
     SparseBallBudget,
 )
+from .certificate import SensitivityBound, sensitivity_bound
 from .costs import Cost, TargetInput, TrackingError
 from .exact import WorstCase, worst_case
 from .gradient import FrankWolfeAttack, LinearizedAttack, ProjectedGradientAttack
@@ -50,10 +51,12 @@ __all__ = [
     "RandomSearchAttack",
     "RelativeBall",
     "RelativeBallBudget",
+    "SensitivityBound",
     "SparseBall",
     "SparseBallBudget",
     "TargetInput",
     "TrackingError",
     "WorstCase",
+    "sensitivity_bound",
     "worst_case",
 ]
