@@ -63,10 +63,10 @@ def factor_cost(E: Tensor) -> CostFactor:
 def _row_stable_qr(E: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return Q, T and the order of the columns of a pivoted QR of E, its rows sorted by size."""
     batch, (k, n) = E.shape[:-2], E.shape[-2:]
-    short = min(k, n)
+    short = min(k, n)  # 0 if the equalities decide everything
     Q, T = np.zeros((batch.numel(), k, short)), np.zeros((batch.numel(), short, n))
     order = np.zeros((batch.numel(), n), dtype=np.int64)
-    for i, matrix in enumerate(E.detach().cpu().reshape(-1, k, n).numpy()):
+    for i, matrix in enumerate(E.detach().cpu().reshape(batch.numel(), k, n).numpy()):
         if short:
             rows = np.argsort(-np.abs(matrix).max(axis=1), kind="stable")
             Q[i, rows], T[i], order[i] = qr(matrix[rows], mode="economic", pivoting=True, check_finite=False)

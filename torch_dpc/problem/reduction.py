@@ -24,6 +24,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, fields, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -31,6 +32,7 @@ from ..autodiff import carries_derivative, constant, untransformed
 from .factorization import ROUNDING, factor_cost
 from .rows import DataRows
 from .saddle import Saddle, known_solution
+from .verification import Map, Posed, Term, verify
 from .weights import Weights, psd_root
 
 
@@ -45,6 +47,9 @@ class Reduction:
         A_theta, A_lam: a = A_theta theta - A_lam lam, `(..., r, n_theta)` and `(..., r, N)`.
         T, Z: the triangle of the cost and a basis of the kernel of Eq, a = Eq^+ e + Z x, `(..., r, n_x)`.
         kernel: how the directions in which the cost is flat move v, `(..., N, n_k)`.
+        error: errors of v, then of Eq a = e, in their units, as the verification bounds them: for a unit of theta, and
+            for multipliers that displace v by a unit, `(..., N + n_eq, 2)`.
+        excess: [V, -G] minus the exact map, `(..., N, n_theta + N)`, where extended precision was needed; else None.
         rows: the data rows behind them.
         weights: the weights behind them.
     """
@@ -57,6 +62,8 @@ class Reduction:
     T: Tensor
     Z: Tensor
     kernel: Tensor
+    error: Tensor
+    excess: Tensor | None
     rows: DataRows
     weights: Weights
 
@@ -152,8 +159,86 @@ def _values(rows: DataRows, weights: Weights) -> Reduction:
     A_theta = Z @ X_theta
     A_theta[..., :, rows.Eq_theta] += rows.Eq_pinv
     A_lam = Z @ torch.linalg.solve_triangular(T, Ct.mT, upper=True)
-    kernel = CZ @ factor.kernel
-    return Reduction(rows.C @ A_theta, Ct @ Ct.mT, Ct, A_theta, A_lam, T, Z, kernel, rows, weights)
+    V, G, kernel = rows.C @ A_theta, Ct @ Ct.mT, CZ @ factor.kernel
+    none = V.new_zeros(*batch, 0, 2)
+    return _verified(Reduction(V, G, Ct, A_theta, A_lam, T, Z, kernel, none, None, rows, weights), factor.kernel)
+
+
+def _verified(reduction: Reduction, kernel: Tensor) -> Reduction:
+    """Return the reduction, corrected where need be, with its errors; `kernel` is that of the cost, in x."""
+    batch, n_theta = reduction.V.shape[:-2], reduction.rows.n_theta
+    flat = reduction.of_batch(batch) if batch else _map_tensors(reduction, lambda x: x[None])
+    problems = [_one_of(flat, i, bool(batch)) for i in range(len(flat.V))]
+    maps = [_map_of(flat, i, k) for i, k in enumerate(kernel.reshape(len(problems), *kernel.shape[-2:]))]
+    checked = [verify(posed, found) for posed, found in zip(problems, maps, strict=True)]
+
+    def stacked(parts: list[np.ndarray]) -> Tensor:
+        return torch.from_numpy(np.stack(parts)).reshape(*batch, *parts[0].shape).to(reduction.V.device)
+
+    error = stacked([verdict.error for _, verdict in checked])
+    if all(verdict.excess is None for _, verdict in checked):
+        return replace(reduction, error=error)
+    values, A = stacked([found.values for found, _ in checked]), stacked([found.A for found, _ in checked])
+    unknown = np.zeros_like(checked[0][0].values)
+    excess = stacked([unknown if verdict.excess is None else verdict.excess for _, verdict in checked])
+    G = -values[..., n_theta:]
+    return replace(
+        reduction,
+        V=values[..., :n_theta].contiguous(),
+        G=(G + G.mT) / 2,
+        A_theta=A[..., :n_theta].contiguous(),
+        A_lam=-A[..., n_theta:],
+        error=error,
+        excess=excess,
+    )
+
+
+def _one_of(flat: Reduction, i: int, is_batched: bool) -> Posed:
+    """Return problem i of a flattened batch as posed, in arrays."""
+    own = flat.rows.C.ndim > 2
+
+    def of_data(tensor: Tensor) -> np.ndarray:
+        return (tensor[i] if own else tensor).cpu().numpy()
+
+    def of_weights(name: str) -> np.ndarray:
+        tensor = getattr(flat.weights, name)
+        return (tensor[i] if is_batched else tensor).cpu().numpy()
+
+    rows, charged = flat.rows, of_data(flat.rows.charged)
+    C = of_data(rows.C)
+    terms = [Term(2 * of_weights("lambda_g"), np.diag(charged)[charged != 0], None)]
+    terms += [
+        Term(of_weights(term.weight), C[term.rows], term.reference)
+        for term in rows.tracking
+        if getattr(flat.weights, term.weight) is not None
+    ]
+    terms += [Term(2 * of_weights(fit.weight), of_data(fit.rows), fit.measured) for fit in rows.fits]
+    return Posed(
+        terms=tuple(terms),
+        C=C,
+        Eq=of_data(rows.Eq),
+        places=rows.Eq_theta.cpu().numpy(),
+        reach=None if rows.Eq_range is None else of_data(rows.Eq_range),
+        Z=flat.Z[i].cpu().numpy(),
+        scale=of_data(rows.scale),
+        theta_scale=of_data(rows.theta_scale),
+    )
+
+
+def _map_of(flat: Reduction, i: int, kernel: Tensor) -> Map:
+    """Return the reduced map of problem i of a flattened batch, in arrays."""
+    V, G, Ct, A_theta, A_lam, T = (
+        x[i].cpu().numpy() for x in (flat.V, flat.G, flat.Ct, flat.A_theta, flat.A_lam, flat.T)
+    )
+    Eq_pinv = flat.rows.Eq_pinv if flat.rows.Eq_pinv.ndim == 2 else flat.rows.Eq_pinv[i]
+    return Map(
+        values=np.concatenate([V, -G], axis=1),
+        A=np.concatenate([A_theta, -A_lam], axis=1),
+        T=T,
+        Ct=Ct,
+        kernel=kernel.cpu().numpy(),
+        Eq_pinv=Eq_pinv.cpu().numpy(),
+    )
 
 
 def _without_rounding(product: Tensor, rows: Tensor) -> Tensor:
