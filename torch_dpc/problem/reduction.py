@@ -52,6 +52,7 @@ class Reduction:
         excess: [V, -G] minus the exact map, `(..., N, n_theta + N)`, where extended precision was needed; else None.
         rows: the data rows behind them.
         weights: the weights behind them.
+        constants: the same without a graph; None if this is it.
     """
 
     V: Tensor
@@ -66,6 +67,7 @@ class Reduction:
     excess: Tensor | None
     rows: DataRows
     weights: Weights
+    constants: Reduction | None = None
 
     @property
     def is_selection(self) -> bool:
@@ -78,14 +80,24 @@ class Reduction:
         return self.rows.scale
 
     def detach(self) -> Reduction:
-        """Return the same numbers without their graph.
+        """Return the same problem without a graph, to the last bit as if there were none."""
+        return self if self.constants is None else self.constants
 
-        With a graph G is C A_lam; here it is Ct Ct' in any case, which loses less, so that a graph changes no result.
-        """
-        rows, weights = _constants(self.rows, self.weights)
-        plain = _map_tensors(self, constant)
-        with untransformed():
-            return replace(plain, G=plain.Ct @ plain.Ct.mT, rows=rows, weights=weights)
+    def in_units(self, unit: Tensor) -> Reduction:
+        """Return the same problem for v / unit and lam unit; units `(N,)` that are powers of two change no digit."""
+        per, rows, excess = 1 / unit[:, None], self.rows, self.excess
+        if excess is not None:
+            excess = excess * per * torch.cat([unit.new_ones(rows.n_theta), 1 / unit])
+        return replace(
+            self,
+            V=self.V * per,
+            G=self.G * per * per.mT,
+            Ct=self.Ct * per,
+            A_lam=self.A_lam * per.mT,
+            kernel=self.kernel * per,
+            excess=excess,
+            rows=replace(rows, C=rows.C * per, scale=rows.scale / unit),
+        )
 
     def of_batch(self, batch: torch.Size) -> Reduction:
         """Return one problem a sample of a flattened batch; itself where all samples share one problem."""
@@ -124,12 +136,12 @@ def reduce(rows: DataRows, weights: Weights) -> Reduction:
     Values come from the QR of E. Where the data or the weights carry a graph, V, G, A_theta and A_lam carry it on, by
     the derivative of the saddle-point system they solve (:mod:`torch_dpc.problem.saddle`).
     """
-    constants = _constants(rows, weights)
+    without_graph = _constants(rows, weights)
     with untransformed():  # LAPACK needs plain numbers, which a transform would wrap
-        values = _values(*constants)
-    reduction = replace(values, rows=rows, weights=weights)
+        values = _values(*without_graph)
     if not carries_derivative((rows.C, rows.Yp, *weights.tensors.values())):
-        return reduction
+        return values
+    reduction = replace(values, rows=rows, weights=weights, constants=values)
     A_theta, A_lam = _with_graph(reduction)
     return replace(reduction, V=rows.C @ A_theta, G=rows.C @ A_lam, A_theta=A_theta, A_lam=A_lam)
 

@@ -76,7 +76,7 @@ class ConvexSet(nn.Module):
     def prox(self, x: Tensor, gamma: Any) -> Tensor:
         """Return the proximal map of the set's indicator, its projection; a penalty in place of a set has another.
 
-        gamma is a number, or a tensor `(..., 1)`.
+        gamma is a number, or a tensor `(..., 1)`; for a separable set one number each entry, `(..., n)`.
         """
         return self.project(x)
 

@@ -185,11 +185,11 @@ class FeasibleSet:
     def prox(self, x: Tensor, gamma: Tensor | float = 1.0) -> Tensor:
         """Return the projection of x, `(..., N)`; the proximal map where a penalty stands in place of a set.
 
-        gamma is one number, or `(..., N)`, equal within every group.
+        gamma is one number, or `(..., N)`, equal within every group of a set that is not separable.
         """
         return _joined(
             [
-                _flat(owner.prox(self._group(x, at, shape), self._scale(gamma, at, shape)))
+                _flat(owner.prox(self._group(x, at, shape), self._scale(gamma, owner, at, shape)))
                 for owner, at, shape in self._slices
             ]
         )
@@ -198,15 +198,18 @@ class FeasibleSet:
         """Return D1 at x."""
         return [
             (owner.jacobian_diagonal if owner.separable else owner.jacobian)(
-                self._group(x, at, shape), self._scale(gamma, at, shape)
+                self._group(x, at, shape), self._scale(gamma, owner, at, shape)
             )
             for owner, at, shape in self._slices
         ]
 
     def largest_of_group(self, x: Tensor) -> Tensor:
-        """Return x, `(N,)`, with the largest entry of its group in place of each."""
-        groups = [(self._group(x, at, shape), shape) for _, at, shape in self._slices]
-        return torch.cat([group.amax(-1, keepdim=True).expand(shape).flatten() for group, shape in groups])
+        """Return x, `(..., N)`, with the largest entry of its group in place of each; separable sets have no groups."""
+        parts = []
+        for owner, at, shape in self._slices:
+            group = self._group(x, at, shape)
+            parts.append(_flat(group if owner.separable else group.amax(-1, keepdim=True).expand_as(group)))
+        return _joined(parts)
 
     def complement_times(self, blocks: Blocks, matrix: Tensor) -> Tensor:
         """Return (I - D1) matrix, `(..., N, k)`."""
@@ -259,12 +262,16 @@ class FeasibleSet:
     def touching(self, v: Tensor, weak: Tensor, reach: float) -> Tensor:
         """Return how many bounds v touches where `weak` says that no multiplier holds it there, `(...)`."""
         count = torch.zeros(v.shape[:-1], dtype=torch.int64, device=v.device)
-        for owner, at, shape in self._slices:
-            slack = owner.slack(self._group(v, at, shape))
-            near = slack.abs() <= reach * (1 + self._group(v, at, shape).abs().amax(-1, keepdim=True))
+        size = self.largest_of_group(v.abs())
+        for (_, at, shape), slack in zip(self._slices, self.slacks(v), strict=True):
+            near = slack.abs() <= reach * (1 + self._group(size, at, shape)[..., : slack.shape[-1]])
             free = self._group(weak, at, shape)
             count = count + (near & (free if slack.shape == free.shape else free[..., :1])).sum((-2, -1))
         return count
+
+    def slacks(self, v: Tensor) -> list[Tensor]:
+        """Return the distance of v to the bounds of each part, `(..., groups, k)`."""
+        return [owner.slack(self._group(v, at, shape)) for owner, at, shape in self._slices]
 
     def supports(self, d: Tensor) -> Tensor:
         """Return the supremum of <d, v> over each group's set, `(..., groups of all parts)`; it may be infinite."""
@@ -338,9 +345,12 @@ class FeasibleSet:
         return zip(self._slices, blocks, strict=True)
 
     @staticmethod
-    def _scale(gamma: Tensor | float, at: slice, shape: tuple[int, ...]) -> Tensor | float:
-        """Return gamma of each group, `(..., groups, 1)`."""
-        return gamma if isinstance(gamma, float) else FeasibleSet._group(gamma, at, shape)[..., :1]
+    def _scale(gamma: Tensor | float, owner: ConvexSet, at: slice, shape: tuple[int, ...]) -> Tensor | float:
+        """Return gamma of each group, `(..., groups, 1)`; of each entry of a separable set."""
+        if isinstance(gamma, float):
+            return gamma
+        group = FeasibleSet._group(gamma, at, shape)
+        return group if owner.separable else group[..., :1]
 
     @staticmethod
     def _group(x: Tensor, at: slice, shape: tuple[int, ...]) -> Tensor:

@@ -32,28 +32,45 @@ class SingleSolver:
 
     Attributes:
         reduction: the reduced problem, without a graph.
+        in_units: the same problem for v / unit.
         sizes: the parts of theta and of v.
-        engines: for the choice of the engine, and DAQP's workspace.
+        engines: of the problem in units: for the choice of the engine, and DAQP's workspace.
+        unit: of each row of v, `(N,)`.
     """
 
     reduction: Reduction
+    in_units: Reduction
     sizes: Sizes
     engines: Engines
+    unit: Tensor
 
     @staticmethod
-    def of(reduction: Reduction, sizes: Sizes, engines: Engines) -> SingleSolver | None:
+    def of(
+        reduction: Reduction, in_units: Reduction, sizes: Sizes, engines: Engines, unit: Tensor
+    ) -> SingleSolver | None:
         """Return the solver; None for a batch of problems, idle inputs, sets that are no boxes, or a GPU."""
         plain = reduction.G.ndim == 2 and reduction.rows.Eq_range is None and engines.structure is None
-        return SingleSolver(reduction, sizes, engines) if plain and reduction.G.device.type == "cpu" else None
+        if not plain or reduction.G.device.type != "cpu":
+            return None
+        return SingleSolver(reduction, in_units, sizes, engines, unit)
 
     @cached_property
     def optimality(self) -> Optimality:
-        """The paper's F, for single samples."""
-        return Optimality(self.reduction, SINGLE)
+        """The judge of single samples."""
+        return Optimality(self.in_units, SINGLE)
 
     @cached_property
     def _G(self) -> np.ndarray:
         return self.reduction.G.contiguous().numpy()
+
+    @cached_property
+    def _G_in_units(self) -> np.ndarray:
+        return self.in_units.G.contiguous().numpy()
+
+    @cached_property
+    def _units(self) -> tuple[np.ndarray, np.ndarray]:
+        """The units and their inverses, which are powers of two as well."""
+        return self.unit.numpy(), (1 / self.unit).numpy()
 
     @cached_property
     def _products(self) -> tuple[np.ndarray, np.ndarray]:
@@ -72,7 +89,8 @@ class SingleSolver:
         if not (daqp_first or kernels.serve(theta)):
             return None
         batch, sample = theta.shape[:-1], theta.numpy()
-        lower, upper = bounds.lower.numpy(), bounds.upper.numpy()
+        per_unit = self._units[1]
+        lower, upper = bounds.lower.numpy() * per_unit, bounds.upper.numpy() * per_unit
         if not batch:
             one = self._one(sample, lower, upper, daqp_first)
             if one is None:
@@ -104,14 +122,16 @@ class SingleSolver:
     def _one(
         self, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray, daqp_first: bool
     ) -> tuple[np.ndarray, ...] | None:
-        """Return v, lam, active and info of one sample; None if its residual is too large."""
-        a0, v0 = self.optimality.unconstrained(theta)
+        """Return v, lam, active and info of one sample, given bounds in units; None if its residual is too large."""
+        v0 = self.optimality.unconstrained(theta)
         if daqp_first and self.engines.workspace is not None:
             lam, flag, iterations = self.engines.workspace.solve(lower - v0, upper - v0, sense_of(lower == upper))
             solved = flag == SOLVED_FLAG
         else:
-            (lam,), (iterations,), (solved,) = kernels.solve_boxes(self._G, v0[None], lower, upper)
-        v, residual, active, n_active, n_weak = self.optimality.judge(theta, a0, v0, lam, lower, upper)
+            (lam,), (iterations,), (solved,) = kernels.solve_boxes(self._G_in_units, v0[None], lower, upper)
+        v, residual, active, n_active, n_weak = self.optimality.judge(theta, v0, lam, lower, upper)
         if not (solved and residual <= ACCEPTANCE.residual_of_one):  # NaN is not either
             return None
-        return v, lam, active, np.array((Status.SOLVED, iterations, residual, n_active, n_weak), dtype=np.float64)
+        unit, per_unit = self._units
+        info = np.array((Status.SOLVED, iterations, residual, n_active, n_weak), dtype=np.float64)
+        return v * unit, lam * per_unit, active, info

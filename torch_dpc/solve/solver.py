@@ -13,13 +13,14 @@ from typing import NamedTuple
 import torch
 from torch import Tensor
 
-from ..batching import flatten_batch, times
+from ..batching import flatten_batch
 from ..errors import Status
 from ..problem.projected_kkt import FullSystem
 from ..problem.reduction import Reduction
 from ..problem.terms import Sizes
 from ..sets.bounds import Bounds
 from ..sets.feasible import Blocks, FeasibleSet
+from ..sets.units import in_units
 from .certificate import is_infeasible
 from .engines import Engines, Sets
 from .optimality import BATCHED, Optimality
@@ -55,9 +56,22 @@ class Solver:
         return Engines(self.reduction, self.structure)
 
     @cached_property
+    def unit(self) -> Tensor:
+        """The units in which the rows of v are solved and judged, `(N,)`: one for all problems of a batch."""
+        unit = self.reduction.scale.reshape(-1, self.sizes.v).amax(0)
+        if self.structure is None:
+            return unit
+        return self.structure.largest_of_group(unit[self.engines.order])[self.engines.inverse]
+
+    @cached_property
+    def in_units(self) -> Solver:
+        """The same problem for v / unit. What is small or near for a row is small or near 1 there."""
+        return replace(self, reduction=self.reduction.in_units(self.unit))
+
+    @cached_property
     def single(self) -> SingleSolver | None:
         """The fast path of single samples; None if there is none for this problem."""
-        return SingleSolver.of(self.reduction, self.sizes, self.engines)
+        return SingleSolver.of(self.reduction, self.in_units.reduction, self.sizes, self.in_units.engines, self.unit)
 
     @cached_property
     def optimality(self) -> Optimality:
@@ -81,7 +95,8 @@ class Solver:
             if planned is not None:
                 return planned
         check_finite(theta, self.sizes)
-        solved = self._solve_flat(theta, sets)
+        solved = self.in_units._solve_flat(theta, in_units(sets, self.unit))
+        solved = solved._replace(v=solved.v * self.unit, lam=solved.lam / self.unit)
         report_failures(solved.info, on_failure)
         planned = Planned(*self.sizes.split(solved.v), solved.lam, solved.active, solved.info)
         if sets.is_box:
@@ -119,15 +134,15 @@ class Solver:
 
     def _solve_all(self, theta: Tensor, sets: Sets) -> Solved:
         """Run the first engine on all samples, the next one on those that it left."""
-        a0, v0 = self.optimality.unconstrained(theta)
+        v0 = self.optimality.unconstrained(theta)
         first, *others = self.engines.in_order(self.engine, v0, sets)
-        solved, gap = self._attempt(first, theta, a0, v0, sets)
+        solved, gap = self._attempt(first, theta, v0, sets)
         for name in others:
             rest = solved.failed.nonzero()[:, 0]
             if len(rest) == 0:
                 return solved
             assert isinstance(sets, Bounds)
-            retried, _ = self._of_samples(rest)._attempt(name, theta[rest], a0[rest], v0[rest], sets.of_samples(rest))
+            retried, _ = self._of_samples(rest)._attempt(name, theta[rest], v0[rest], sets.of_samples(rest))
             solved.put(rest, retried)
         if bool(solved.failed.any()):
             self._mark_failures(solved, theta, v0, gap, sets)
@@ -138,28 +153,28 @@ class Solver:
         shared = self.reduction.G.ndim == 2
         return self if shared else replace(self, reduction=self.reduction.of_samples(samples))
 
-    def _attempt(self, engine: str, theta: Tensor, a0: Tensor, v0: Tensor, sets: Sets) -> tuple[Solved, Tensor | None]:
+    def _attempt(self, engine: str, theta: Tensor, v0: Tensor, sets: Sets) -> tuple[Solved, Tensor | None]:
         """Run one engine and judge what it found; return the gap that it saw as well."""
         found = self.engines.run(engine, v0, sets)
         judge = self._judge_box if isinstance(sets, Bounds) else self._judge_sets
-        v, residual, active, weak, counts = judge(theta, a0, v0, found.lam, sets)  # type: ignore[arg-type]
+        v, residual, active, weak, counts = judge(theta, v0, found.lam, sets)  # type: ignore[arg-type]
         failed = ~(found.converged & (residual <= ACCEPTANCE.residual)) | self.reduction.rows.unreachable(theta)
         columns = failed * Status.FAILED, found.iterations, residual, *counts
         info = torch.stack([x.double() for x in columns], dim=-1)
         return Solved(v, found.lam, active, info, weak), found.gap
 
-    def _judge_box(self, theta: Tensor, a0: Tensor, v0: Tensor, lam: Tensor, sets: Bounds) -> _Judged:
-        v, residual, active, n_active, n_weakly_active = self.optimality.judge(theta, a0, v0, lam, *sets.tensors)
+    def _judge_box(self, theta: Tensor, v0: Tensor, lam: Tensor, sets: Bounds) -> _Judged:
+        v, residual, active, n_active, n_weakly_active = self.optimality.judge(theta, v0, lam, *sets.tensors)
         return _Judged(v, residual, active, None, (n_active, n_weakly_active))
 
-    def _judge_sets(self, theta: Tensor, a0: Tensor, v0: Tensor, lam: Tensor, sets: FeasibleSet) -> _Judged:
-        """Judge by F with the projection onto the sets; count the directions that D holds, block by block."""
+    def _judge_sets(self, theta: Tensor, v0: Tensor, lam: Tensor, sets: FeasibleSet) -> _Judged:
+        """Judge with the projection onto the sets; count the directions that D holds, block by block."""
         order, inverse, gamma = self.engines.order, self.engines.inverse, self.engines.gamma
-        a = a0 - times(self.reduction.A_lam, lam)
-        raw = times(self.reduction.rows.C, a)
+        raw = self.optimality.displaced(v0, lam)[..., order]
         lam_in_parts = lam[..., order]
-        v = sets.prox(raw[..., order] + lam_in_parts)
-        residual = self.optimality.residual(theta, a, a0, raw, v[..., inverse], v0, lam)
+        v = sets.prox(raw + gamma * lam_in_parts, gamma)
+        missed = (raw - v).abs() / (1 + sets.largest_of_group(v.abs()))
+        residual = self.optimality.residual(theta, lam, missed)
         diagonal = self.engines.G_in_parts.diagonal(dim1=-2, dim2=-1)
         weak = sets.weak(v, is_without_multiplier(v, lam_in_parts, diagonal)).expand_as(v)
         d, _ = sets.spectral(sets.freed(sets.jacobians(v + gamma * lam_in_parts, gamma), weak))

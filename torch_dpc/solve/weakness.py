@@ -1,7 +1,8 @@
 """When is a constraint weakly active?  One rule, for the solve and for every derivative.
 
 A row that touches its bound has a multiplier of zero or not, and rounding would decide which. So a multiplier counts as
-zero if the displacement that it makes, G_ii lam_i, is at most :data:`WEAKLY_ACTIVE` relative to 1 + |v_i|. A row that
+zero if the displacement that it makes, G_ii lam_i, is at most :data:`WEAKLY_ACTIVE` relative to 1 + |v_i|, v in units
+(:meth:`torch_dpc.problem.reduction.Reduction.in_units`). A row that
 touches its bound with such a multiplier is *weakly active*, and counts as inactive (D1 = 1) in every derivative.
 """
 
