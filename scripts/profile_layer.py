@@ -77,23 +77,25 @@ def stages_of(layer: dpc.DPCLayer, problems: list[Problem]) -> tuple[Stages, Sta
     thetas = [_theta(layer, problem) for problem in problems]
     solved = [solver.solve(theta, sets, "raise") for theta in thetas]
     one = thetas[0].ndim == 1  # one problem: NumPy around the kernel; many: torch
-    optimality, as_array = solver.optimality, (Tensor.numpy if one else lambda tensor: tensor)
+    in_units, unit = solver.in_units, solver.unit  # what is inside the solve
+    optimality, as_array = in_units.optimality, (Tensor.numpy if one else lambda tensor: tensor)
     if one:
         assert solver.single is not None
         optimality = solver.single.optimality
+    lower, upper = lower / unit, upper / unit
     samples, lo, up = [as_array(theta) for theta in thetas], as_array(lower), as_array(upper)
-    starts: list[tuple[Any, Any]] = [optimality.unconstrained(sample) for sample in samples]
-    lams = [as_array(found.lam) for found in solved]
-    G = reduction.G.contiguous().numpy()
+    starts: list[Any] = [optimality.unconstrained(sample) for sample in samples]
+    lams = [as_array(found.lam * unit) for found in solved]
+    G = in_units.reduction.G.contiguous().numpy()
 
     def judge(i: int) -> Any:
-        a0, v0 = starts[i]
-        return optimality.judge(samples[i], a0, v0, lams[i], lo, up)
+        raw, error = optimality.displaced(starts[i], lams[i]), optimality.error(samples[i], lams[i])
+        return optimality.judge(raw, lams[i], lo, up, error)
 
     def find(start: Any) -> Any:
         if one:
-            return kernels.solve_boxes(G, start[1][None], lo, up)
-        return solve_newton(reduction.G, reduction.Ct, start[1], lower, upper)
+            return kernels.solve_boxes(G, start[None], lo, up)
+        return solve_newton(in_units.reduction.G, in_units.reduction.Ct, start, lower, upper)
 
     bars, N = [torch.ones_like(found.lam) for found in solved], len(lower)
     flat = [(f.active.reshape(-1, N), bar.reshape(-1, N), None) for f, bar in zip(solved, bars, strict=True)]

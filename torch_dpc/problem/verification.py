@@ -39,7 +39,7 @@ class VerificationSettings:
     explained: float = 8.0
     doubtful: float = 1e-6
     convincing: float = 1e-10
-    corrections: int = 3
+    corrections: int = 5
 
 
 SETTINGS = VerificationSettings()
@@ -106,7 +106,7 @@ class Map:
 
     Attributes:
         values: [V, -G], `(N, m)`.
-        A: [A_theta, -A_lam], `(r, m)`.
+        A: [A_theta, -A_lam], `(r, m)`; in extended precision while it is corrected.
         T, Ct: the triangle of the cost, and C Z T^-1.
         kernel: orthonormal basis of the kernel of the cost in x, `(n_x, n_k)`.
         Eq_pinv: the pseudo-inverse of Eq.
@@ -151,7 +151,7 @@ def verify(posed: Posed, found: Map, settings: VerificationSettings = SETTINGS) 
         if not judged.error.max() < verdict.error.max():
             break
         best, verdict = candidate, judged
-    return best, verdict
+    return replace(best, A=best.A.astype(float)), verdict
 
 
 def _check(posed: Posed, found: Map, settings: VerificationSettings) -> Verdict:
@@ -206,7 +206,7 @@ def _corrected(extended: Posed, found: Map) -> Map:
     A = A - found.Eq_pinv @ missed
     slope, _ = extended.slope(A)
     A = A - extended.Z @ solve_triangular(found.T, _translated(found, slope.astype(float)))
-    return replace(found, A=A.astype(float), values=(extended.C @ A).astype(float))
+    return replace(found, A=A, values=(extended.C @ A).astype(float))
 
 
 def _translated(found: Map, slope: Array) -> Array:

@@ -204,7 +204,12 @@ class FeasibleSet:
         ]
 
     def largest_of_group(self, x: Tensor) -> Tensor:
-        """Return x, `(..., N)`, with the largest entry of its group in place of each; separable sets have no groups."""
+        """Return x, `(..., N)`, with the largest entry of its group in place of each."""
+        groups = [self._group(x, at, shape) for _, at, shape in self._slices]
+        return _joined([_flat(group.amax(-1, keepdim=True).expand_as(group)) for group in groups])
+
+    def largest_of_coupled(self, x: Tensor) -> Tensor:
+        """Return x, `(..., N)`, with the largest of the entries that its set couples it with in place of each."""
         parts = []
         for owner, at, shape in self._slices:
             group = self._group(x, at, shape)
@@ -262,7 +267,7 @@ class FeasibleSet:
     def touching(self, v: Tensor, weak: Tensor, reach: float) -> Tensor:
         """Return how many bounds v touches where `weak` says that no multiplier holds it there, `(...)`."""
         count = torch.zeros(v.shape[:-1], dtype=torch.int64, device=v.device)
-        size = self.largest_of_group(v.abs())
+        size = self.largest_of_coupled(v.abs())
         for (_, at, shape), slack in zip(self._slices, self.slacks(v), strict=True):
             near = slack.abs() <= reach * (1 + self._group(size, at, shape)[..., : slack.shape[-1]])
             free = self._group(weak, at, shape)

@@ -66,7 +66,8 @@ def is_infeasible(Ct: Tensor, v0: Tensor, sets: Bounds | FeasibleSet, gap: Tenso
 
 def _by_gap(Ct: Tensor, v0: Tensor, sets: FeasibleSet, gap: Tensor) -> Tensor:
     left, singular, _ = torch.linalg.svd(Ct, full_matrices=False)
-    span = left * (singular > SETTINGS.rank * singular.amax(-1, keepdim=True)).to(Ct)[..., None, :]
+    largest = singular[..., :1]  # none if the equalities decide everything
+    span = left * (singular > SETTINGS.rank * largest).to(Ct)[..., None, :]
     d = gap
     for _ in range(SETTINGS.alternations):
         d = _unit(sets.bounded_direction(d - times(span, times(span.mT, d))))

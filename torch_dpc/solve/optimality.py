@@ -7,8 +7,8 @@ u_ini, u = Uf g, y = Yf g, and stationarity with the weights as given) was verif
     v_i = Proj(v + d lam)_i      relative to  1 + |v_i|,      d_i = G_ii (equal within the group of a set),
 
 and, where the cost has a kernel, that lam does no work along it: otherwise a plan of lower cost lies that way. The
-residual is the worst row, and the errors of the map at this theta and lam on top. Where they decide, the sample is
-judged anew in extended precision.
+residual is the worst row, and the errors of the map at this theta and lam on top. Where that does not convince, the
+sample gets a second look in extended precision (:mod:`torch_dpc.solve.second_look`).
 
 The code runs on batches of torch tensors `(B, n)` and on single samples as NumPy arrays `(n,)`, whose calls cost a
 third of torch's.
@@ -27,8 +27,6 @@ from torch import Tensor
 from ..problem.reduction import Reduction
 from .weakness import is_without_multiplier, reach_of
 
-#: Errors of the map above this are looked at in extended precision: a hundredth of what is accepted.
-DOUBTFUL = 1e-10
 #: Keeps 0 / 0 at 0.
 _TINY = 1e-300
 
@@ -104,7 +102,6 @@ class Optimality:
         self._per_theta, self._moved = array(1 / reduction.rows.theta_scale), array(diagonal / reduction.scale)
         worst = reduction.error.amax(-2)
         self._error = (float(worst[0]), float(worst[1])) if worst.ndim == 1 else worst.unbind(-1)
-        self._reduction = reduction
 
     def unconstrained(self, theta: Any) -> Any:
         """Return the unconstrained minimiser V theta."""
@@ -114,11 +111,23 @@ class Optimality:
         """Return v0 - G lam."""
         return v0 - self._combine(lam, self._G)
 
-    def judge(self, theta: Any, v0: Any, lam: Any, lower: Any, upper: Any) -> Judged:
-        """Return what the conditions say of multipliers lam; bounds are `(N,)` or one a sample."""
-        raw, displacement = self.displaced(v0, lam), lam * self.diagonal
-        v = self._clip(raw + displacement, lower, upper)  # at a solution raw, and on its bound where lam holds a row
-        residual = self.residual(theta, lam, abs(raw - v) / (1 + abs(v)))
+    def error(self, theta: Any, lam: Any) -> Any:
+        """Return a bound on what the errors of the map, and rounding, do to a row of V theta - G lam."""
+        of_theta, of_lam = self._error
+        return of_theta * self._largest(abs(theta * self._per_theta)) + of_lam * (abs(lam) * self._moved).sum(-1)
+
+    def judge(self, raw: Any, lam: Any, lower: Any, upper: Any, error: Any) -> Judged:
+        """Return what the conditions say of multipliers lam.
+
+        Args:
+            raw: V theta - G lam, and
+            error: the error of that.
+            lam: the multipliers.
+            lower, upper: bounds, `(N,)` or one a sample.
+        """
+        # At a solution v is raw, and on its bound where a multiplier holds the row.
+        v = self._clip(raw + lam * self.diagonal, lower, upper)
+        residual = self.residual(lam, abs(raw - v) / (1 + abs(v)), error)
         reach = reach_of(v)
         # A difference to an infinite bound is infinite, and so never within reach.
         touching = (upper - v <= reach) | (v - lower <= reach)
@@ -127,10 +136,8 @@ class Optimality:
         n_active = self._count(active)
         return Judged(v, residual, active, n_active, self._count(touching) - n_active)
 
-    def residual(self, theta: Any, lam: Any, missed: Any) -> Any:
-        """Return the residual, given how far each row is from its set, relative to 1 + |v|."""
-        of_theta, of_lam = self._error
-        error = of_theta * self._largest(abs(theta * self._per_theta)) + of_lam * (abs(lam) * self._moved).sum(-1)
+    def residual(self, lam: Any, missed: Any, error: Any) -> Any:
+        """Return the residual, given how far each row is from its set, relative to 1 + |v|, and the map's error."""
         residual = self._largest(missed) + error
         if self._kernel is None:
             return residual

@@ -129,7 +129,9 @@ class SingleSolver:
             solved = flag == SOLVED_FLAG
         else:
             (lam,), (iterations,), (solved,) = kernels.solve_boxes(self._G_in_units, v0[None], lower, upper)
-        v, residual, active, n_active, n_weak = self.optimality.judge(theta, v0, lam, lower, upper)
+        v, residual, active, n_active, n_weak = self.optimality.judge(
+            self.optimality.displaced(v0, lam), lam, lower, upper, self.optimality.error(theta, lam)
+        )
         if not (solved and residual <= ACCEPTANCE.residual_of_one):  # NaN is not either
             return None
         unit, per_unit = self._units

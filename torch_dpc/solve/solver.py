@@ -7,7 +7,7 @@ certificate of infeasibility where both did.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from typing import NamedTuple
 
 import torch
@@ -21,10 +21,13 @@ from ..problem.terms import Sizes
 from ..sets.bounds import Bounds
 from ..sets.feasible import Blocks, FeasibleSet
 from ..sets.units import in_units
+from .active_set import solve_active
 from .certificate import is_infeasible
 from .engines import Engines, Sets
 from .optimality import BATCHED, Optimality
 from .outcome import ACCEPTANCE, Planned, Solved, check_finite, joined, report_failures
+from .projected_system import newton_step
+from .second_look import SecondLook
 from .single import SingleSolver
 from .weakness import WEAKLY_ACTIVE, is_without_multiplier
 
@@ -61,7 +64,7 @@ class Solver:
         unit = self.reduction.scale.reshape(-1, self.sizes.v).amax(0)
         if self.structure is None:
             return unit
-        return self.structure.largest_of_group(unit[self.engines.order])[self.engines.inverse]
+        return self.structure.largest_of_coupled(unit[self.engines.order])[self.engines.inverse]
 
     @cached_property
     def in_units(self) -> Solver:
@@ -156,25 +159,61 @@ class Solver:
     def _attempt(self, engine: str, theta: Tensor, v0: Tensor, sets: Sets) -> tuple[Solved, Tensor | None]:
         """Run one engine and judge what it found; return the gap that it saw as well."""
         found = self.engines.run(engine, v0, sets)
-        judge = self._judge_box if isinstance(sets, Bounds) else self._judge_sets
-        v, residual, active, weak, counts = judge(theta, v0, found.lam, sets)  # type: ignore[arg-type]
-        failed = ~(found.converged & (residual <= ACCEPTANCE.residual)) | self.reduction.rows.unreachable(theta)
-        columns = failed * Status.FAILED, found.iterations, residual, *counts
-        info = torch.stack([x.double() for x in columns], dim=-1)
-        return Solved(v, found.lam, active, info, weak), found.gap
+        raw, error = self.optimality.displaced(v0, found.lam), self.optimality.error(theta, found.lam)
+        solved = self._judged(raw, found.lam, sets, error, found.iterations)
+        doubtful = ~(solved.info[..., 2] <= ACCEPTANCE.convincing)
+        if bool(doubtful.any()):
+            self._look_again(solved, theta, sets, doubtful)
+        solved.info[..., 0][self.reduction.rows.unreachable(theta)] = int(Status.FAILED)
+        return solved, found.gap
 
-    def _judge_box(self, theta: Tensor, v0: Tensor, lam: Tensor, sets: Bounds) -> _Judged:
-        v, residual, active, n_active, n_weakly_active = self.optimality.judge(theta, v0, lam, *sets.tensors)
+    def _look_again(self, solved: Solved, theta: Tensor, sets: Sets, doubtful: Tensor) -> None:
+        """Judge doubtful samples anew by the map in extended precision, their multipliers polished."""
+        if isinstance(sets, FeasibleSet) and sets.batch_shape:
+            solver, before, where = self, solved, doubtful  # the sets cannot be had sample by sample: all of them
+        else:
+            where = doubtful.nonzero()[:, 0]
+            solver, theta, before = self._of_samples(where), theta[where], solved.map(lambda x: x[where])
+        if isinstance(sets, Bounds):
+            sets = sets.of_samples(where)
+        step = partial(solver._step, sets=sets, held=before.lam != 0)
+        lam, raw = SecondLook(solver.reduction).polished(theta, before.lam, step)
+        judged = solver._judged(raw, lam, sets, torch.zeros_like(lam[..., 0]), before.info[..., 1])
+        better = judged.info[..., 2] < before.info[..., 2]
+        better = better & doubtful if where is doubtful else better
+        solved.put(better if where is doubtful else where[better], judged.map(lambda x: x[better]))
+
+    def _step(self, raw: Tensor, lam: Tensor, sets: Sets, held: Tensor) -> Tensor:
+        """Return Newton's step on the multipliers; for boxes on those of the rows that are held."""
+        if isinstance(sets, Bounds):
+            on = torch.where(lam > 0, sets.upper, sets.lower)
+            missed = torch.where(held & on.isfinite(), raw - on, 0.0)
+            return solve_active(self.reduction.G, self.reduction.Ct, held, missed)[0]
+        order, inverse, gamma = self.engines.order, self.engines.inverse, self.engines.gamma
+        pushed = raw[..., order] + gamma * lam[..., order]
+        missed = raw[..., order] - sets.prox(pushed, gamma)
+        return newton_step(self.engines.G_in_parts, sets, sets.jacobians(pushed, gamma), missed, gamma)[..., inverse]
+
+    def _judged(self, raw: Tensor, lam: Tensor, sets: Sets, error: Tensor, iterations: Tensor) -> Solved:
+        """Judge multipliers, given V theta - G lam and its error."""
+        judge = self._judge_box if isinstance(sets, Bounds) else self._judge_sets
+        v, residual, active, weak, counts = judge(raw, lam, sets, error)  # type: ignore[arg-type]
+        failed = ~(residual <= ACCEPTANCE.residual)
+        info = torch.stack([x.double() for x in (failed * Status.FAILED, iterations, residual, *counts)], dim=-1)
+        return Solved(v, lam, active, info, weak)
+
+    def _judge_box(self, raw: Tensor, lam: Tensor, sets: Bounds, error: Tensor) -> _Judged:
+        v, residual, active, n_active, n_weakly_active = self.optimality.judge(raw, lam, *sets.tensors, error)
         return _Judged(v, residual, active, None, (n_active, n_weakly_active))
 
-    def _judge_sets(self, theta: Tensor, v0: Tensor, lam: Tensor, sets: FeasibleSet) -> _Judged:
+    def _judge_sets(self, raw: Tensor, lam: Tensor, sets: FeasibleSet, error: Tensor) -> _Judged:
         """Judge with the projection onto the sets; count the directions that D holds, block by block."""
         order, inverse, gamma = self.engines.order, self.engines.inverse, self.engines.gamma
-        raw = self.optimality.displaced(v0, lam)[..., order]
+        raw = raw[..., order]
         lam_in_parts = lam[..., order]
         v = sets.prox(raw + gamma * lam_in_parts, gamma)
-        missed = (raw - v).abs() / (1 + sets.largest_of_group(v.abs()))
-        residual = self.optimality.residual(theta, lam, missed)
+        missed = (raw - v).abs() / (1 + sets.largest_of_coupled(v.abs()))
+        residual = self.optimality.residual(lam, missed, error)
         diagonal = self.engines.G_in_parts.diagonal(dim1=-2, dim2=-1)
         weak = sets.weak(v, is_without_multiplier(v, lam_in_parts, diagonal)).expand_as(v)
         d, _ = sets.spectral(sets.freed(sets.jacobians(v + gamma * lam_in_parts, gamma), weak))
