@@ -120,12 +120,25 @@ class Recovery:
         self.data.require_windows()
         reduction = self.reduction
         a = times(reduction.A_theta, self.theta) - times(reduction.A_lam, self.planned.lam)
+        a = a + self._rounding_of(a)
         basis = self.data.basis.to(a.device)
         if not carries_derivative((reduction.rows.C,)):
             return times(basis, a)
-        # g = D^+ (D g), so that the data behind D are differentiated too.
-        D = self.data.stacked.to(a.device)
-        return times(torch.linalg.pinv(D, rtol=1e-10), times(D @ basis, a))
+        # g = D^+ (D g), so that the data behind D are differentiated too; D in units, which g does not see.
+        D = self.data.stacked.to(a.device) / reduction.rows.theta_scale[..., None]
+        return times(torch.linalg.pinv(D, rtol=reduction.rows.tolerance), times(D @ basis, a))
+
+    def _rounding_of(self, a: Tensor) -> Tensor:
+        """Return the least change of a that brings Up g, Uf g, Yf g onto u_ini, u, y: what large multipliers round."""
+        with torch.no_grad():
+            rows, theta = self.reduction.detach().rows, self.theta.detach()
+            v = torch.cat([x.detach().flatten(-2) for x in (self.planned.u, self.planned.y)], dim=-1)
+            n = v.shape[-1]
+            wanted = torch.cat([theta[..., rows.Eq_theta].expand(*v.shape[:-1], -1), v], dim=-1)
+            held = torch.cat([rows.Eq, rows.C[..., :n, :]], dim=-2)
+            unit = torch.cat([rows.theta_scale[..., rows.Eq_theta], rows.scale[..., :n]], dim=-1)
+            missed = torch.nan_to_num((wanted - times(held, a.detach())) / unit)
+            return times(torch.linalg.pinv(held / unit[..., None], rtol=rows.tolerance), missed)
 
     def _value(self) -> Tensor:
         planned = self.planned

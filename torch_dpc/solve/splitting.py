@@ -63,8 +63,8 @@ def scale_of(G: Tensor, sets: FeasibleSet) -> Tensor:
     """Return gamma, `(N,)`, from the diagonal of G: the largest of each group, and of all problems."""
     diagonal = G.diagonal(dim1=-2, dim2=-1)
     diagonal = diagonal.reshape(-1, diagonal.shape[-1]).amax(0)
-    least = 1e-6 * diagonal.amax().clamp_min(torch.finfo(G.dtype).tiny)
-    return sets.largest_of_group(diagonal).clamp_min(float(least))
+    largest = float(diagonal.amax())
+    return sets.largest_of_group(diagonal).clamp_min(1e-6 * largest if largest > 0 else 1.0)
 
 
 def resolvent_of(G: Tensor, gamma: Tensor) -> Tensor:
