@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -12,6 +12,7 @@ from .bounds import Bounds
 from .box import Box, SoftBox
 from .curved import Ball, SecondOrderCone
 from .feasible import FeasibleSet
+from .units import SetsInUnits
 
 #: The kinds of blocks.
 BALL, CONE = 1, 2
@@ -83,7 +84,7 @@ def values_of(sets: Bounds | FeasibleSet, batch: torch.Size, device: torch.devic
         radii.append(radius)
     start = torch.tensor([0, *sizes], device=device).cumsum(0)
     none = torch.zeros(0, dtype=torch.int64, device=device)
-    return SetValues(
+    values = SetValues(
         _flat(lower, batch),
         _flat(upper, batch),
         None if bool(price.isinf().all()) else _flat(price, batch),
@@ -92,6 +93,20 @@ def values_of(sets: Bounds | FeasibleSet, batch: torch.Size, device: torch.devic
         torch.cat(rows) if rows else none,
         _flat(_joined(centers, device), batch),
         _flat(_joined(radii, device), batch),
+    )
+    return _in_units(values, sets.unit[sets.inverse.to(device)]) if isinstance(sets, SetsInUnits) else values
+
+
+def _in_units(values: SetValues, unit: Tensor) -> SetValues:
+    """Return the sets for v / unit and lam unit; the unit `(N,)` in the order of v, one number within each block."""
+    of_rows = unit[values.rows]
+    return replace(
+        values,
+        lower=values.lower / unit,
+        upper=values.upper / unit,
+        price=None if values.price is None else values.price * unit,
+        center=values.center / of_rows,
+        radius=values.radius / of_rows[values.start[:-1]],
     )
 
 
