@@ -71,7 +71,7 @@ def calls_of(layer: dpc.DPCLayer, problems: list[Problem]) -> Stages:
 def stages_of(layer: dpc.DPCLayer, problems: list[Problem]) -> tuple[Stages, Stages, Stages]:
     """Return the stages around the solve, inside it, and of the backward; and the whole solve among the first."""
     device = torch.device("cpu")
-    solver = layer._factored(device).solver
+    solver = layer.factored(device).solver
     reduction, (lower, upper) = solver.reduction, layer.bounds(device)
     sets = Bounds(lower, upper)
     thetas = [_theta(layer, problem) for problem in problems]
@@ -102,7 +102,7 @@ def stages_of(layer: dpc.DPCLayer, problems: list[Problem]) -> tuple[Stages, Sta
     A, C, n = reduction.A_theta, reduction.rows.C, len(problems)
     around = {
         "checks and flattening": lambda i: _theta(layer, problems[i % n]),
-        "weights and bounds unchanged?": lambda i: (layer._factored(device), layer.bounds(device)),
+        "weights and bounds unchanged?": lambda i: (layer.factored(device), layer.bounds(device)),
         "the whole solve": lambda i: solver.solve(thetas[i % n], sets, "raise"),
     }
     inside = {

@@ -3,7 +3,7 @@
 import importlib
 from types import ModuleType
 
-from . import attacks, plot, systems, tuning
+from . import attacks, operators, plot, systems, tuning
 from .attacks import (
     BallBudget,
     BoxBudget,

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import contextlib
-import functools
+import itertools
 import os
+import weakref
 from typing import Any
 
 import torch
@@ -27,6 +28,18 @@ from .solution import DPCSolution, solution_of
 from .solve.derivative import plan
 from .solve.engines import Sets
 from .solve.recovery import Recovery
+from .tracing import batches_of, described, flat_parameters, planned_by_operator
+
+#: The layers of this process; compiled models find them by their handles.
+layers_by_handle: weakref.WeakValueDictionary[int, DPCLayer] = weakref.WeakValueDictionary()
+_handles = itertools.count()
+
+
+def register(layer: DPCLayer) -> int:
+    """Return a new handle of a layer."""
+    handle = next(_handles)
+    layers_by_handle[handle] = layer
+    return handle
 
 
 class DPCLayer(nn.Module):
@@ -99,6 +112,7 @@ class DPCLayer(nn.Module):
         super().__init__()
         self._setup_cache: tuple[Settings, Setup] | None = None
         self._factors = Factors()
+        self._handle = register(self)
         self.data = data
         self.Q, self.R, self.lambda_g, self.lambda_s = Q, R, lambda_g, lambda_s
         self.lambda_u, self.R_du = lambda_u, R_du
@@ -134,7 +148,7 @@ class DPCLayer(nn.Module):
         """The weights as they are now."""
         return GivenWeights(self.Q, self.R, self.lambda_g, self.lambda_s, self.lambda_u, self.R_du)
 
-    def _factored(self, device: torch.device) -> Factored:
+    def factored(self, device: torch.device) -> Factored:
         """Return the reduced problem of the present weights and its solver."""
         return self._factors.factored(self._setup, self._given, device)
 
@@ -160,7 +174,7 @@ class DPCLayer(nn.Module):
     @property
     def reduction(self) -> Reduction:
         """The reduced problem of the present weights; see :mod:`torch_dpc.problem.reduction`."""
-        return self._factored(self.data.device).reduction
+        return self.factored(self.data.device).reduction
 
     @property
     def feasible_set(self) -> FeasibleSet:
@@ -201,13 +215,33 @@ class DPCLayer(nn.Module):
             InfeasibleError: a sample has no solution, provably (with `on_failure="raise"`).
             SolveError: a sample could not be solved (likewise).
         """
-        if torch.compiler.is_compiling():  # a compiled model breaks its graph here
-            return _uncompiled()(self, u_ini, y_ini, y_ref, u_ref, on_failure)
-        return self._call(u_ini, y_ini, y_ref, u_ref, on_failure)
-
-    def _call(self, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any, on_failure: str | None) -> DPCSolution:
+        if torch.compiler.is_compiling():
+            return self._traced(u_ini, y_ini, y_ref, u_ref, on_failure)
         theta, dtype = self.flatten(u_ini, y_ini, y_ref, u_ref)
-        return self._plan(theta, self._factors.sets(self._setup, theta.device), dtype, on_failure)
+        return self._plan(theta, self.present_sets(theta.device), dtype, on_failure)
+
+    def _traced(self, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any, on_failure: str | None) -> DPCSolution:
+        """Plan by an operator, while torch compiles or exports."""
+        text, tensors = described(self) if torch.compiler.is_exporting() else ("", self.own_tensors())
+        data, weights = self.data, (self.Q, self.R, self.R_du, self.lambda_g, self.lambda_s, self.lambda_u)
+        theta, dtype = flat_parameters(data, u_ini, y_ini, y_ref, u_ref, batches_of(data, weights))
+        rates = self.R_du is not None or self.du_set is not None
+        sizes = [data.horizon, data.n_u, data.n_y, data.horizon * data.n_u if rates else 0]
+        on_failure = self.on_failure if on_failure is None else on_failure
+        return planned_by_operator(theta, tensors, self._handle, text, on_failure, sizes, dtype)
+
+    def own_tensors(self) -> list[Tensor]:
+        """Return the weights that are tensors, then the parameters of the sets."""
+        weights = (self.Q, self.R, self.R_du, self.lambda_g, self.lambda_s, self.lambda_u)
+        sets = [self.u_set, self.y_set] if self.du_set is None else [self.u_set, self.y_set, self.du_set]
+        found = [weight for weight in weights if isinstance(weight, Tensor)]
+        for owner in sets:
+            found += list(owner.parameters())
+        return found
+
+    def present_sets(self, device: torch.device) -> Sets:
+        """Return the sets with their present parameters, as a solve takes them."""
+        return self._factors.sets(self._setup, device)
 
     def plan(
         self,
@@ -229,7 +263,7 @@ class DPCLayer(nn.Module):
         return self._plan(theta, Bounds(lower, upper), dtype, on_failure)
 
     def _plan(self, theta: Tensor, sets: Sets, dtype: torch.dtype, on_failure: str | None) -> DPCSolution:
-        factored = self._factored(theta.device)
+        factored = self.factored(theta.device)
         batches = sets.batches(theta.device)
         if batches or factored.reduction.V.ndim > 2:
             one_batch([("the samples", theta.shape[:-1]), *factored.problem.batches, *batches])
@@ -357,8 +391,7 @@ class DPCLayer(nn.Module):
         """Leave the factors out of copies and pickles: they are made again when needed."""
         return {**self.__dict__, "_factors": Factors(), "_setup_cache": None}
 
-
-@functools.cache
-def _uncompiled() -> Any:
-    """`DPCLayer._call` out of the compiler's reach; made when it is there, because importing it takes a second."""
-    return torch.compiler.disable(DPCLayer._call)
+    def __setstate__(self, state: dict[str, Any]) -> None:
+        """Give a copy a handle of its own."""
+        super().__setstate__(state)
+        self._handle = register(self)

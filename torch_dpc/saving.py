@@ -65,12 +65,15 @@ def load_layer(cls: type[Any], path: str | os.PathLike[str]) -> Any:
         raise ValueError(f"{os.fspath(path)!r} is not a whole torch_dpc file: {error!r}.") from error
 
 
-def layer_to_tree(layer: Any, *, data: bool = False, live: bool = False) -> tuple[dict[str, Any], dict[str, Tensor]]:
+def layer_to_tree(
+    layer: Any, *, data: bool = False, compact: HankelData | None = None, live: bool = False
+) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Return a layer as a tree of JSON and the tensors that it names.
 
     Args:
         layer: a `DPCLayer`.
         data: with the recorded windows; otherwise the data are compact.
+        compact: the compact data, if they are known already.
         live: with the layer's own tensors in place of copies of their values.
 
     Raises:
@@ -83,9 +86,10 @@ def layer_to_tree(layer: Any, *, data: bool = False, live: bool = False) -> tupl
         raise ValueError("a layer on a batch of data sets cannot be saved: save one layer for each.")
     if data:
         held.require_windows()
+    kept = held if data else held.compressed() if compact is None else compact
     text = {
         "version": VERSION,
-        "data": _data_to_tree(held if data else held.compressed(), writer),
+        "data": _data_to_tree(kept, writer),
         "arguments": {name: writer.tree(value, f"`{name}`", name) for name, value in arguments_of(layer).items()},
     }
     return text, writer.tensors
@@ -109,7 +113,8 @@ def _data_to_tree(data: HankelData, writer: _Writer) -> dict[str, Any]:
     tree: dict[str, Any] = {name: getattr(data, name) for name in _DATA_NUMBERS}
     tree["recorded_as"] = None if data.recorded_as is None else str(data.recorded_as).removeprefix("torch.")
     for name in _MATRICES:
-        writer.tensors[f"data.{name}"] = _plain(getattr(data, name))
+        matrix = getattr(data, name)
+        writer.tensors[f"data.{name}"] = matrix if writer.live else _plain(matrix)
     if not data.has_windows:  # compact data know their rank, as it was decided on the windows
         tree["row_space"] = {name: getattr(data.row_space, name) for name in _SPACE_NUMBERS}
     return tree
@@ -146,7 +151,7 @@ class _Writer:
 
     def __init__(self, *, live: bool = False) -> None:
         self.tensors: dict[str, Tensor] = {}
-        self._live = live
+        self.live = live
         self._seen: dict[int, tuple[Any, dict[str, Any]]] = {}  # a parameter used twice stays one
 
     def tree(self, value: Any, what: str, key: str) -> Any:
@@ -180,7 +185,7 @@ class _Writer:
 
     def _tensor(self, tensor: Tensor, key: str) -> dict[str, Any]:
         if id(tensor) not in self._seen:
-            self.tensors[key] = tensor if self._live else _plain(tensor)
+            self.tensors[key] = tensor if self.live else _plain(tensor)
             learns = tensor.is_leaf and tensor.requires_grad  # what a graph made is kept as its value
             tree = {"tensor": key, "parameter": isinstance(tensor, nn.Parameter), "requires_grad": learns}
             self._seen[id(tensor)] = (tensor, tree)

@@ -73,7 +73,7 @@ class SolveInfo:
         try:
             return SolveInfo, (table, self.is_selection, _Constant(self.nonsingular.detach()))
         except NotImplementedError:
-            return SolveInfo, (table, self.is_selection, _Lost())
+            return SolveInfo, (table, self.is_selection, lost)
 
     def __copy__(self) -> SolveInfo:
         """Return a copy that shares everything."""
@@ -237,12 +237,9 @@ class _Constant:
         return self.value
 
 
-@dataclass(frozen=True, eq=False)
-class _Lost:
-    """`nonsingular` of an info that was taken apart or pickled before it was asked for."""
-
-    def __call__(self) -> Tensor:
-        raise NotImplementedError("`nonsingular` was not computed before the plan was taken apart: ask for it earlier.")
+def lost() -> Tensor:
+    """Raise NotImplementedError: `nonsingular` of an info that was taken apart before it was asked for."""
+    raise NotImplementedError("`nonsingular` was not computed before the plan was taken apart: ask for it earlier.")
 
 
 def _flatten(plan: DPCSolution) -> tuple[list[Any], tuple[bool, Later]]:
@@ -262,10 +259,18 @@ def _flatten_info(info: SolveInfo) -> tuple[list[Any], bool]:
 
 def _unflatten_info(children: Iterable[Any], is_selection: bool) -> SolveInfo:
     (table,) = children
-    return SolveInfo(table, is_selection, _Lost())
+    return SolveInfo(table, is_selection, lost)
 
 
-register_pytree_node(DPCSolution, _flatten, _unflatten, serialized_type_name="torch_dpc.DPCSolution")
+# The output of an exported program loses what is computed when asked for.
+register_pytree_node(
+    DPCSolution,
+    _flatten,
+    _unflatten,
+    serialized_type_name="torch_dpc.DPCSolution",
+    to_dumpable_context=lambda context: context[0],
+    from_dumpable_context=lambda is_selection: (is_selection, Thunks({}, "it is of an exported program")),
+)
 register_pytree_node(SolveInfo, _flatten_info, _unflatten_info, serialized_type_name="torch_dpc.SolveInfo")
 
 

@@ -60,19 +60,19 @@ class FeasibleSet:
     @property
     def tensors(self) -> list[Tensor]:
         """The tensors that the sets hold."""
-        return [holder[name] for owner, _ in self.parts for holder, name in _places_of(owner)]
+        return [holder[name] for owner, _ in self.parts for holder, name in places_of(owner)]
 
     def with_tensors(self, tensors: Iterable[Tensor]) -> FeasibleSet:
         """Return a snapshot with these in place of `tensors`."""
         copy = self.snapshot()
-        places = [place for owner, _ in copy.parts for place in _places_of(owner)]
+        places = [place for owner, _ in copy.parts for place in places_of(owner)]
         for (holder, name), tensor in zip(places, tensors, strict=True):
             holder[name] = tensor
         return copy
 
     def snapshot(self) -> FeasibleSet:
         """Return the same sets with the parameters that they have now."""
-        return FeasibleSet([(cast(ConvexSet, _snapshot(owner)), places) for owner, places in self.parts], self.names)
+        return FeasibleSet([(cast(ConvexSet, snapshot_of(owner)), places) for owner, places in self.parts], self.names)
 
     @cached_property
     def order(self) -> Tensor:
@@ -377,13 +377,13 @@ def _is_box(owner: ConvexSet) -> bool:
     return isinstance(owner, Box) and cls.project is Box.project and cls.prox is Box.prox
 
 
-def _snapshot(module: nn.Module) -> nn.Module:
+def snapshot_of(module: nn.Module) -> nn.Module:
     """Return a copy that shares the tensors of a module, but not the places that hold them."""
     copy = object.__new__(type(module))
     copy.__dict__.update(module.__dict__)
     copy.__dict__["_parameters"] = dict(module._parameters)
     copy.__dict__["_buffers"] = dict(module._buffers)
-    copy.__dict__["_modules"] = {k: None if m is None else _snapshot(m) for k, m in module._modules.items()}
+    copy.__dict__["_modules"] = {k: None if m is None else snapshot_of(m) for k, m in module._modules.items()}
     return copy
 
 
@@ -392,7 +392,7 @@ def _flat(x: Tensor) -> Tensor:
     return x.reshape(*x.shape[:-2], x.shape[-2] * x.shape[-1])
 
 
-def _places_of(module: nn.Module) -> list[tuple[dict[str, Any], str]]:
+def places_of(module: nn.Module) -> list[tuple[dict[str, Any], str]]:
     """Return where a module and its children hold tensors, as parameters, buffers or attributes."""
     holders = (holder for part in module.modules() for holder in (part._parameters, part._buffers, part.__dict__))
     return [(holder, name) for holder in holders for name, value in holder.items() if isinstance(value, Tensor)]

@@ -183,9 +183,9 @@ class _FactoredOnce(DPCLayer):
 
     _kept: Factored | None = None
 
-    def _factored(self, device: torch.device) -> Factored:
+    def factored(self, device: torch.device) -> Factored:
         if self._kept is None:
-            self._kept = super()._factored(device)
+            self._kept = super().factored(device)
         return self._kept
 
 
