@@ -3,7 +3,8 @@
 import importlib
 from types import ModuleType
 
-from . import attacks, operators, plot, systems, tuning
+from . import attacks, plot, systems, tuning
+from . import operators as _operators  # noqa: F401  # defines torch.ops.torch_dpc
 from .attacks import (
     BallBudget,
     BoxBudget,
