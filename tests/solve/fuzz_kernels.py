@@ -23,7 +23,7 @@ SETTINGS = {
     **{"hysteresis": 1e-12, "independence": 1e-5, "touching": 1e-10, "primal_dual_steps": 10},
     **{"converged": 1e-13, "good": 1e-10, "close": 1e-11, "newton_steps": 25, "halvings": 12, "rounds": 10},
     **{"patience": 5, "inner_steps": 20, "bisections": 20, "growth": 10.0, "largest_penalty": 1e7},
-    **{"weakness": 1e-9, "accepted": 1e-8},
+    **{"weakness": 1e-9, "convincing": 1e-9},
 }
 SIZES = (0, 1, 2, 3, 5, 16, 17, 33, 40)
 COUNTS = (0, 1, 2, 7, 100)

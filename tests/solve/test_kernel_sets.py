@@ -1,5 +1,7 @@
 """The compiled kernel for priced intervals, balls and cones against projections and differences of its own."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -265,11 +267,9 @@ def test_a_whole_call_is_its_parts(mixture, seed):
     for of_call in (found, again):
         np.testing.assert_allclose(of_call.v, verdict.v.numpy() * of.unit, rtol=1e-9, atol=1e-10)
         np.testing.assert_allclose(of_call.info[:, 3:], verdict.counts)
-    errors = 1e-15 * np.abs(theta).max(1) + 1e-16 * (np.abs(again.lam * of.unit) * of.moved).sum(1)
-    missed = np.abs(raw - verdict.v.numpy()).max(1)
-    assert (again.info[:, 2] >= errors).all() and (again.info[:, 2] <= missed + errors + 1e-12).all()
+    assert found.convinces.all() and (again.info[:, 2] <= verdict.missed.numpy().max(1) + 1e-12).all()
     bar, lam_bar = randn(*found.v.shape, seed=1).numpy(), randn(*found.v.shape, seed=2).numpy()
-    at = found.v, found.lam, found.weak
+    at = found.v, found.lam, found.active, found.weak
     result = kernels.plan_adjoint(of, sets, at, bar, lam_bar, of_theta=True)
     assert result is not None
     rhs = lam_bar / of.unit - (bar * of.unit) @ of.G
@@ -278,6 +278,16 @@ def test_a_whole_call_is_its_parts(mixture, seed):
     expected = bar + moved.numpy() / of.unit
     np.testing.assert_allclose(result[0], expected, rtol=1e-9, atol=1e-10)
     np.testing.assert_allclose(result[1], (expected * of.unit) @ of.V, rtol=1e-9, atol=1e-9)
+
+
+def test_a_map_with_a_large_error_does_not_convince():
+    problem = Problem(4, kinds=(), prices=0.0)
+    of, sets, theta = whole(problem)
+    sizes = np.abs(theta).max(1), (np.abs(kernels.plan(of, sets, theta).lam * of.unit) * of.moved).sum(1)
+    for field, size in zip(("error_of_theta", "error_of_lam"), sizes, strict=True):
+        most = kernels.SETTINGS.convincing / size[size > 0].max()
+        assert kernels.plan(replace(of, **{field: 0.9 * most}), sets, theta).convinces.all()
+        assert not kernels.plan(replace(of, **{field: 1.1 * most}), sets, theta).convinces.all()
 
 
 def test_a_plan_without_a_solution_is_marked():

@@ -14,7 +14,8 @@ from ..autodiff import is_mapped, is_plain
 from ..checks import one_batch
 from .base import ConvexSet, Part
 from .bounds import Bounds
-from .box import Box, SoftBox
+from .box import Box, NonNegative, Reals, SoftBox
+from .curved import Ball, SecondOrderCone
 from .product import Product
 
 #: The Jacobian of the projection, part by part: its diagonal `(..., groups, size)` where the set is separable, blocks
@@ -63,7 +64,10 @@ class FeasibleSet:
         return [holder[name] for owner, _ in self.parts for holder, name in places_of(owner)]
 
     def with_tensors(self, tensors: Iterable[Tensor]) -> FeasibleSet:
-        """Return a snapshot with these in place of `tensors`."""
+        """Return a snapshot with these in place of `tensors`; itself if they are the same."""
+        tensors = list(tensors)
+        if all(new is own for new, own in zip(tensors, self.tensors, strict=True)):
+            return self
         copy = self.snapshot()
         places = [place for owner, _ in copy.parts for place in places_of(owner)]
         for (holder, name), tensor in zip(places, tensors, strict=True):
@@ -129,11 +133,13 @@ class FeasibleSet:
         return None if self.is_box else self
 
     @property
-    def sources(self) -> tuple[Tensor | float, ...] | None:
-        """What the bounds of a box are made of; None if the sets are no box, whose parameters may be anything."""
-        if not self.is_box:
+    def sources(self) -> tuple[Any, ...] | None:
+        """What the sets are made of, to compare by value; None if that is not known, of a set of the user's own."""
+        if self.is_box:
+            return tuple(bound for owner, _ in self.parts for bound in (owner.lower, owner.upper))
+        if not all(type(owner) in (Box, Reals, NonNegative, SoftBox, Ball, SecondOrderCone) for owner, _ in self.parts):
             return None
-        return tuple(bound for owner, _ in self.parts for bound in (owner.lower, owner.upper))  # type: ignore[misc]
+        return tuple(argument for owner, _ in self.parts for argument in owner.config().values())
 
     def check_engine(self, solver: str) -> None:
         """Raise ValueError if the forward engine of that name cannot solve for these sets."""

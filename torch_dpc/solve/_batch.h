@@ -57,8 +57,8 @@ typedef struct {
     Numbers v, lam;              /* solve_held: the solution; judge: lam */
     Numbers raw;                 /* judge: v0 - G lam */
     Numbers v_bar, lam_bar;      /* adjoint; lam_bar may be missing, and is then zero */
-    const unsigned char *active; /* (count, n): solve_active, adjoint */
-    const unsigned char *weak;   /* (count, n): solve_held */
+    const unsigned char *active; /* (count, n): solve_active, adjoint, plan_adjoint */
+    const unsigned char *weak;   /* (count, n): solve_held, plan_adjoint */
     double *result;              /* (count, n): lam, the solution, the adjoint, or v */
     double *missed;              /* (count, n): judge */
     unsigned char *is_weak, *is_active; /* (count, n): judge, plan */
@@ -123,7 +123,8 @@ INLINE void solve_held_sample(const Batch *b, Workspace *w, int64_t i) {
     prepare(&intervals, w);
     const Sets sets = sets_of_sample(b, w, i);
     scale_multipliers(&sets, w);
-    const Held held = list_held_at_solution(&sets, w, of_sample(&b->v, i), of_sample(&b->lam, i), b->weak + i * b->n);
+    const Held held = list_held_at_solution(
+        &sets, w, of_sample(&b->v, i), of_sample(&b->lam, i), NULL, b->weak + i * b->n);
     for (int64_t j = 0; j < held.rows; j++) w->rhs[w->rows[j]] = rhs[w->rows[j]];
     b->succeeded[i] = (unsigned char)solve_held(&sets, w, G, NULL, held, b->settings->least_pivot);
     for (int64_t j = 0; b->succeeded[i] && j < held.rows; j++) result[w->rows[j]] = w->x[j];
@@ -151,8 +152,8 @@ INLINE void plan_sample(const Batch *b, Workspace *w, int64_t i) {
     const double *theta = of_sample(&b->theta, i), *v0 = of_sample(&b->v0, i), *G = of_sample(&b->G, i);
     double *info = b->info + INFO * i, largest = 0.0, error, missed = 0.0;
     int64_t iterations = 0, counts[2];
-    b->succeeded[i] = (unsigned char)reserve_curved(w);
-    if (!b->succeeded[i]) return;
+    b->succeeded[i] = 0;
+    if (!reserve_curved(w)) return;
     if (!v0) {
         for (int64_t j = 0; j < n; j++) w->v0[j] = dot(map->V + j * map->n_theta, theta, map->n_theta);
         v0 = w->v0;
@@ -173,9 +174,10 @@ INLINE void plan_sample(const Batch *b, Workspace *w, int64_t i) {
         b->result[at + j] *= map->unit[j];
         b->result_lam[at + j] = w->lam[j] / map->unit[j];
     }
-    info[0] = solved && missed + error <= b->settings->accepted ? SOLVED : FAILED;
+    b->succeeded[i] = solved && missed + error <= b->settings->convincing;
+    info[0] = b->succeeded[i] ? SOLVED : FAILED;
     info[1] = (double)iterations;
-    info[2] = missed + error;
+    info[2] = missed;
     info[3] = (double)counts[0], info[4] = (double)counts[1];
 }
 
@@ -197,7 +199,7 @@ INLINE void plan_adjoint_sample(const Batch *b, Workspace *w, int64_t i) {
         v_units[j] = v[j] / map->unit[j], lam_units[j] = lam[j] * map->unit[j];
         bar[j] = v_bar[j] * map->unit[j];
     }
-    const Held held = list_held_at_solution(&sets, w, v_units, lam_units, b->weak + i * n);
+    const Held held = list_held_at_solution(&sets, w, v_units, lam_units, b->active + i * n, b->weak + i * n);
     for (int64_t j = 0; j < held.rows; j++) {
         const int64_t row = w->rows[j];
         w->rhs[row] = (lam_bar ? lam_bar[row] / map->unit[row] : 0.0) - dot(G + row * n, bar, n);

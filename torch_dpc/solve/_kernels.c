@@ -236,14 +236,14 @@ static PyObject *settings(PyObject *self, PyObject *args, PyObject *keywords) {
     (void)self;
     static char *names[] = {"hysteresis", "independence", "touching", "primal_dual_steps", "converged", "good", "close",
                             "newton_steps", "halvings", "rounds", "patience", "inner_steps", "bisections", "growth",
-                            "largest_penalty", "weakness", "accepted", NULL};
+                            "largest_penalty", "weakness", "convincing", NULL};
     double independence;
     Settings s;
     _Static_assert(sizeof(long long) == sizeof s.rounds, "the format L reads an int64_t");
     if (!PyArg_ParseTupleAndKeywords(
             args, keywords, "$dddLdddLLLLLLdddd", names, &s.hysteresis, &independence, &s.touching, &s.primal_dual_steps,
             &s.converged, &s.good, &s.close, &s.newton_steps, &s.halvings, &s.rounds, &s.patience, &s.inner_steps,
-            &s.bisections, &s.growth, &s.largest_penalty, &s.weakness, &s.accepted))
+            &s.bisections, &s.growth, &s.largest_penalty, &s.weakness, &s.convincing))
         return NULL;
     s.least_pivot = independence * independence;
     Settings *made = malloc(sizeof *made);
@@ -366,7 +366,7 @@ static PyObject *plan(PyObject *self, PyObject *const *args, Py_ssize_t count) {
                take_table(&held, args[6], "active", '?', &b, b.n, &is_active) &&
                take_table(&held, args[7], "weak", '?', &b, b.n, &is_weak) &&
                take_table(&held, args[8], "info", 'd', &b, INFO, &info) &&
-               take_succeeded(&held, args[9], "done", &b) && take_options(args + 10, &b, &threads);
+               take_succeeded(&held, args[9], "convinces", &b) && take_options(args + 10, &b, &threads);
     if (is_ready) b.theta = (Numbers){theta->buf, b.map.n_theta}, b.result = v->buf;
     b.result_lam = lam, b.is_active = is_active, b.is_weak = is_weak, b.info = info;
     return finish(&held, is_ready, &b, plan_work, threads);
@@ -378,16 +378,16 @@ static PyObject *plan_adjoint(PyObject *self, PyObject *const *args, Py_ssize_t 
     Batch b = {0};
     int64_t threads = 1;
     void *theta_bar = NULL;
-    if (!has_arguments(count, 12)) return NULL;
-    const Py_buffer *v_bar = take_first(&held, args[5], "v_bar");
+    if (!has_arguments(count, 13)) return NULL;
+    const Py_buffer *v_bar = take_first(&held, args[6], "v_bar");
     const int is_ready =
         v_bar && take_map(&held, args[0], v_bar->shape[0], v_bar->shape[1], &b) && take_sets(&held, args[1], &b) &&
         take_rows(&held, args[2], "v", &b, 0, b.n, &b.v) && take_rows(&held, args[3], "lam", &b, 0, b.n, &b.lam) &&
-        take_flags(&held, args[4], "weak", &b, &b.weak) &&
-        (args[6] == Py_None || take_rows(&held, args[6], "lam_bar", &b, 0, b.n, &b.lam_bar)) &&
-        take_result(&held, args[7], "v0_bar", &b) &&
-        (args[8] == Py_None || take_table(&held, args[8], "theta_bar", 'd', &b, b.map.n_theta, &theta_bar)) &&
-        take_succeeded(&held, args[9], "trusted", &b) && take_options(args + 10, &b, &threads);
+        take_flags(&held, args[4], "active", &b, &b.active) && take_flags(&held, args[5], "weak", &b, &b.weak) &&
+        (args[7] == Py_None || take_rows(&held, args[7], "lam_bar", &b, 0, b.n, &b.lam_bar)) &&
+        take_result(&held, args[8], "v0_bar", &b) &&
+        (args[9] == Py_None || take_table(&held, args[9], "theta_bar", 'd', &b, b.map.n_theta, &theta_bar)) &&
+        take_succeeded(&held, args[10], "trusted", &b) && take_options(args + 11, &b, &threads);
     if (is_ready) b.v_bar = (Numbers){v_bar->buf, b.n}, b.theta_bar = theta_bar;
     return finish(&held, is_ready, &b, plan_adjoint_work, threads);
 }
@@ -433,9 +433,9 @@ static PyMethodDef methods[] = {
     {"judge_sets", FUNCTION(judge_sets), METH_FASTCALL,
      "judge_sets(G, sets, raw, lam, v, missed, weak, active, counts, done, settings, threads)"},
     {"plan", FUNCTION(plan), METH_FASTCALL,
-     "plan(map, sets, theta, v0, v, lam, active, weak, info, done, settings, threads)"},
+     "plan(map, sets, theta, v0, v, lam, active, weak, info, convinces, settings, threads)"},
     {"plan_adjoint", FUNCTION(plan_adjoint), METH_FASTCALL,
-     "plan_adjoint(map, sets, v, lam, weak, v_bar, lam_bar, v0_bar, theta_bar, trusted, settings, threads)"},
+     "plan_adjoint(map, sets, v, lam, active, weak, v_bar, lam_bar, v0_bar, theta_bar, trusted, settings, threads)"},
     {"solve_active", FUNCTION(solve_active), METH_FASTCALL,
      "solve_active(G, active, rhs, out, trusted, settings, threads)"},
     {"adjoint", FUNCTION(adjoint), METH_FASTCALL,

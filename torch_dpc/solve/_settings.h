@@ -21,7 +21,7 @@ typedef struct {
     double growth;             /* of the penalty from round to round */
     double largest_penalty;    /* gamma / reach */
     double weakness;           /* displacements and distances up to this, relative to 1 + |v|, count as zero */
-    double accepted;           /* the residual of a plan that is accepted */
+    double convincing;         /* the residual of a plan, and the error of the map, that need no second look */
 } Settings;
 
 #endif

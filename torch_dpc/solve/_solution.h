@@ -21,14 +21,18 @@ INLINE int is_row_held(const Sets *sets, int64_t row, double x, double gamma) {
     return is_point(sets, row) || (pull > 0.0 && pull <= gamma * sets->price[row]);
 }
 
-/* List what is held at a solution, for derivatives: what is `weak` counts as free, a block if all of it is. */
+/* List what is held at a solution, for derivatives: what is `weak` counts as free, a block if all of it is. `active`
+ * says which intervals hold their row; NULL if v and lam have to. */
 INLINE Held list_held_at_solution(
-    const Sets *sets, Workspace *w, const double *v, const double *lam, const unsigned char *weak) {
+    const Sets *sets, Workspace *w, const double *v, const double *lam, const unsigned char *active,
+    const unsigned char *weak) {
     Curved *c = &w->curved;
     int64_t k = 0;
     for (int64_t i = 0; i < w->n; i++) {
         c->pushed[i] = v[i] + c->gamma[i] * lam[i];
-        if (!weak[i] && is_row_held(sets, i, c->pushed[i], c->gamma[i])) w->rows[k++] = i;
+        const int is_bounded = sets->lower[i] > -INFINITY || sets->upper[i] < INFINITY; /* rows of blocks are not */
+        const int is_held = active ? active[i] : !weak[i] && is_row_held(sets, i, c->pushed[i], c->gamma[i]);
+        if (is_bounded && is_held) w->rows[k++] = i;
     }
     block_states_at(sets, w, c->pushed, c->gamma);
     for (int64_t b = 0; b < sets->blocks; b++) {

@@ -26,6 +26,7 @@ from torch import Tensor
 
 from ..autodiff import apply_function, carries_derivative, is_plain, refuse_forward_twice
 from ..batching import lead_all, outer, times
+from ..errors import Status
 from ..problem.reduction import Reduction
 from ..sets.bounds import Bounds
 from ..sets.parameters import check_order
@@ -82,7 +83,8 @@ class Plan(torch.autograd.Function):
         if sets.is_box:
             return tuple(solver.solve(theta, sets.with_tensors(of_sets), on_failure)[:5])
         with torch.no_grad():
-            planned = solver.solve(theta.detach(), sets.with_tensors(x.detach() for x in of_sets), on_failure)
+            constants = [x.detach() if x.requires_grad else x for x in of_sets]
+            planned = solver.solve(theta.detach(), sets.with_tensors(constants), on_failure)
         return tuple(x for x in planned if x is not None)
 
     @staticmethod
@@ -119,9 +121,8 @@ class Plan(torch.autograd.Function):
         need, solver = ctx.needs_input_grad, ctx.solver
         is_final = not torch.is_grad_enabled() and all(map(is_plain, bars))  # nothing will be derived again
         saved = saved_by(ctx)  # once: checkpoints of the graph refuse a second look
-        if is_final and solver.single is not None and solver.full is None and not (ctx.may_fail or any(need[1:])):
-            active = saved[1]
-            theta_bar = solver.single.adjoint(active, u_bar, y_bar, lam_bar) if active.ndim == 1 else None
+        if is_final and solver.full is None and not (ctx.has_matrices or any(need[1:])):
+            theta_bar = _compiled_adjoint(ctx, saved, u_bar, y_bar, lam_bar, du_bar)
             if theta_bar is not None:
                 return theta_bar, *(None,) * (len(need) - 1)
         at = Linearization(ctx, saved)
@@ -189,6 +190,31 @@ class Plan(torch.autograd.Function):
             tensors = [*lead_all((theta,), in_dims[:1], (1,), info.batch_size), *of_sets]
         outputs = Plan.apply(tensors[0], A, C, G, solver, sets, on_failure, *tensors[1:])
         return outputs, (0,) * len(outputs)
+
+
+def _compiled_adjoint(
+    ctx: Any,
+    saved: tuple[Tensor, ...],
+    u_bar: Tensor | None,
+    y_bar: Tensor | None,
+    lam_bar: Tensor | None,
+    du_bar: Tensor | None,
+) -> Tensor | None:
+    """Return theta_bar by the compiled kernel; None if it does not take the sets, or does not trust its system."""
+    planner, sizes = ctx.solver.compiled, ctx.solver.sizes
+    if planner is None:
+        return None
+    lam, active, info, *of_curved = saved
+    v_bar, v, weak = joined(sizes, u_bar, y_bar, du_bar, lam), lam, active  # for boxes v and weak do not count
+    if not ctx.sets.is_box:
+        u, y, du, weak, *_ = of_curved
+        v = joined(sizes, u, y, du, lam)
+    if ctx.may_fail:  # samples without a solution add nothing, whatever came back for their NaN
+        solved = info[..., :1] == Status.SOLVED
+        v_bar, v = torch.where(solved, v_bar, 0.0), torch.where(solved, v, 0.0)
+        lam_bar = None if lam_bar is None else torch.where(solved, lam_bar, 0.0)
+    found = planner.adjoint(ctx.sets, (v, lam, active, weak), v_bar, lam_bar)
+    return None if found is None else found[1]
 
 
 # `apply` binds its arguments by the signature of `forward` at every call; finding it anew each time costs 15 us.

@@ -65,8 +65,8 @@ class KernelSettings:
     largest_penalty: float = 1e7
     #: Displacements and distances up to this, relative to 1 + |v|, count as zero.
     weakness: float = WEAKLY_ACTIVE
-    #: Residual of an accepted plan.
-    accepted: float = ACCEPTANCE.residual
+    #: The residual of a plan, together with the error of the map, that needs no second look.
+    convincing: float = ACCEPTANCE.convincing
 
     @cached_property
     def compiled(self) -> Any:
@@ -193,13 +193,21 @@ class Map:
 
 
 class PlannedArrays(NamedTuple):
-    """Plans as `plan` makes them: v, lam `(B, N)`; active, weak `(B, N)`, boolean; and info `(B, 5)`."""
+    """Plans as `plan` makes them.
+
+    Attributes:
+        v, lam: `(B, N)`, in the caller's units.
+        active, weak: `(B, N)`, boolean.
+        info: as in :class:`torch_dpc.solve.outcome.Solved`, `(B, 5)`.
+        convinces: which samples need no second look, `(B,)`, boolean. What is there of others is no plan.
+    """
 
     v: np.ndarray
     lam: np.ndarray
     active: np.ndarray
     weak: np.ndarray
     info: np.ndarray
+    convinces: np.ndarray
 
 
 def plan(of: Map, sets: SetArrays, theta: np.ndarray, v0: np.ndarray | None = None, threads: int = 1) -> PlannedArrays:
@@ -211,24 +219,19 @@ def plan(of: Map, sets: SetArrays, theta: np.ndarray, v0: np.ndarray | None = No
         theta: `(B, n_theta)`.
         v0: V theta `(B, N)`, if it is known.
         threads: the most to use.
-
-    Returns:
-        v and lam in the caller's units, and the judgement; `info` is that of :class:`torch_dpc.solve.outcome.Solved`.
     """
     shape, count = (len(theta), len(of.unit)), len(theta)
     flags = np.empty(shape, dtype=bool), np.empty(shape, dtype=bool)
-    results = PlannedArrays(np.empty(shape), np.empty(shape), *flags, np.empty((count, 5)))
-    done = np.empty(count, dtype=bool)
-    _kernels.plan(of.arguments, sets, theta, v0, *results, done, SETTINGS.compiled, threads)
-    if not done.all():
-        raise MemoryError("no memory for a plan.")
+    convinces = np.empty(count, dtype=bool)
+    results = PlannedArrays(np.empty(shape), np.empty(shape), *flags, np.empty((count, 5)), convinces)
+    _kernels.plan(of.arguments, sets, theta, v0, *results, SETTINGS.compiled, threads)
     return results
 
 
 def plan_adjoint(
     of: Map,
     sets: SetArrays,
-    at: tuple[np.ndarray, np.ndarray, np.ndarray],
+    at: tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray],
     v_bar: np.ndarray,
     lam_bar: np.ndarray | None,
     *,
@@ -240,7 +243,7 @@ def plan_adjoint(
     Args:
         of: the reduced problem.
         sets: in units, from `set_arrays`.
-        at: v, lam and the weak rows of the plan, `(B, N)`.
+        at: v, lam, active and weak rows of the plan, `(B, N)`; v and weak rows count for balls and cones alone.
         v_bar, lam_bar: cotangents `(B, N)`, in the caller's units like v; lam_bar may be missing.
         of_theta: whether theta_bar is wanted.
         threads: the most to use.

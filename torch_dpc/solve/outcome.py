@@ -21,12 +21,10 @@ class Acceptance:
     Attributes:
         residual: largest residual of an accepted sample (:mod:`torch_dpc.solve.optimality`).
         convincing: residual above which a sample gets a second look in extended precision.
-        residual_of_one: largest residual of the single-sample path; a larger one sends the sample to the batched path.
     """
 
     residual: float = 1e-8
-    convincing: float = 1e-10
-    residual_of_one: float = 1e-11
+    convincing: float = 1e-9
 
 
 ACCEPTANCE = Acceptance()

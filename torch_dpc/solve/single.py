@@ -1,4 +1,4 @@
-"""The fast path of a few samples with boxes on the CPU: solved and judged one after the other in NumPy.
+"""A few samples with boxes on the CPU without the compiled kernels: DAQP, one after the other, judged in NumPy.
 
 NumPy's calls cost a third of torch's. A sample whose residual is not convincing sends the call to the batched path.
 """
@@ -16,7 +16,6 @@ from ..errors import Status
 from ..problem.reduction import Reduction
 from ..problem.terms import Sizes
 from ..sets.bounds import Bounds
-from . import kernels
 from .daqp import SOLVED_FLAG, sense_of
 from .engines import Engines
 from .optimality import SINGLE, Optimality
@@ -60,22 +59,9 @@ class SingleSolver:
         return Optimality(self.in_units, SINGLE)
 
     @cached_property
-    def _G(self) -> np.ndarray:
-        return self.reduction.G.contiguous().numpy()
-
-    @cached_property
-    def _G_in_units(self) -> np.ndarray:
-        return self.in_units.G.contiguous().numpy()
-
-    @cached_property
     def _units(self) -> tuple[np.ndarray, np.ndarray]:
         """The units and their inverses, which are powers of two as well."""
         return self.unit.numpy(), (1 / self.unit).numpy()
-
-    @cached_property
-    def _products(self) -> tuple[np.ndarray, np.ndarray]:
-        """A_theta and C."""
-        return self.reduction.A_theta.numpy(), self.reduction.rows.C.numpy()
 
     def solve(self, theta: Tensor, bounds: Bounds, chosen: str) -> Planned | None:
         """Return the plans; None if there are more samples than a few or one of them has no convincing solution.
@@ -85,54 +71,33 @@ class SingleSolver:
         n_theta = theta.shape[-1]
         if theta.numel() > FEW * n_theta or not bounds.are_shared or theta.device.type != "cpu":
             return None
-        daqp_first = self.engines.is_daqp_first(chosen, theta)
-        if not (daqp_first or kernels.serve(theta)):
+        if not self.engines.is_daqp_first(chosen, theta):
             return None
         batch, sample = theta.shape[:-1], theta.numpy()
         per_unit = self._units[1]
         lower, upper = bounds.lower.numpy() * per_unit, bounds.upper.numpy() * per_unit
         if not batch:
-            one = self._one(sample, lower, upper, daqp_first)
+            one = self._one(sample, lower, upper)
             if one is None:
                 return None
             v, *rest = one
         else:
-            several = [self._one(row, lower, upper, daqp_first) for row in sample.reshape(-1, n_theta)]
+            several = [self._one(row, lower, upper) for row in sample.reshape(-1, n_theta)]
             found = [one for one in several if one is not None]
             if not found or len(found) < len(several):
                 return None
             v, *rest = (np.stack(x).reshape((*batch, -1)) for x in zip(*found, strict=True))
         return Planned(*map(torch.from_numpy, (*self.sizes.split(v), *rest)))
 
-    def adjoint(
-        self, active: Tensor, u_bar: Tensor | None, y_bar: Tensor | None, lam_bar: Tensor | None
-    ) -> Tensor | None:
-        """Return theta_bar of one sample, `(n_theta,)`; None if the kernel does not serve or trust its system."""
-        if not kernels.serve(active):
-            return None
-        v_bar, n_u = np.zeros(len(active)), self.sizes.u
-        for bar, part in ((u_bar, v_bar[:n_u]), (y_bar, v_bar[n_u : n_u + self.sizes.y])):
-            if bar is not None:
-                part[:] = bar.numpy().reshape(-1)
-        lam_array = None if lam_bar is None else kernels.as_array(lam_bar)
-        v0_bar = kernels.adjoint_of_one(self._G, active.numpy(), v_bar, lam_array)
-        A, C = self._products
-        return None if v0_bar is None else torch.from_numpy(v0_bar.dot(C).dot(A))
-
-    def _one(
-        self, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray, daqp_first: bool
-    ) -> tuple[np.ndarray, ...] | None:
+    def _one(self, theta: np.ndarray, lower: np.ndarray, upper: np.ndarray) -> tuple[np.ndarray, ...] | None:
         """Return v, lam, active and info of one sample, given bounds in units; None if its residual is too large."""
         v0 = self.optimality.unconstrained(theta)
-        if daqp_first and self.engines.workspace is not None:
-            lam, flag, iterations = self.engines.workspace.solve(lower - v0, upper - v0, sense_of(lower == upper))
-            solved = flag == SOLVED_FLAG
-        else:
-            (lam,), (iterations,), (solved,) = kernels.solve_boxes(self._G_in_units, v0[None], lower, upper)
+        assert self.engines.workspace is not None
+        lam, flag, iterations = self.engines.workspace.solve(lower - v0, upper - v0, sense_of(lower == upper))
         v, residual, active, n_active, n_weak = self.optimality.judge(
             self.optimality.displaced(v0, lam), lam, lower, upper, self.optimality.error(theta, lam)
         )
-        if not (solved and residual <= ACCEPTANCE.residual_of_one):  # NaN is not either
+        if not (flag == SOLVED_FLAG and residual <= ACCEPTANCE.convincing):  # NaN is not either
             return None
         unit, per_unit = self._units
         info = np.array((Status.SOLVED, iterations, residual, n_active, n_weak), dtype=np.float64)

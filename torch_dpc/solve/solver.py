@@ -23,6 +23,7 @@ from ..sets.feasible import Blocks, FeasibleSet
 from ..sets.units import in_units
 from .active_set import solve_active
 from .certificate import is_infeasible
+from .compiled import CompiledPlanner
 from .engines import Engines, Sets
 from .optimality import BATCHED, Optimality
 from .outcome import ACCEPTANCE, Planned, Solved, check_finite, joined, report_failures
@@ -77,6 +78,11 @@ class Solver:
         return SingleSolver.of(self.reduction, self.in_units.reduction, self.sizes, self.in_units.engines, self.unit)
 
     @cached_property
+    def compiled(self) -> CompiledPlanner | None:
+        """Whole plans by the compiled kernel; None if it does not take this problem."""
+        return CompiledPlanner.of(self.in_units.reduction, self.unit)
+
+    @cached_property
     def optimality(self) -> Optimality:
         """The paper's F, for batches."""
         return Optimality(self.reduction, BATCHED)
@@ -97,14 +103,30 @@ class Solver:
             planned = self.single.solve(theta, sets, self.engine)
             if planned is not None:
                 return planned
-        check_finite(theta, self.sizes)
-        solved = self.in_units._solve_flat(theta, in_units(sets, self.unit))
-        solved = solved._replace(v=solved.v * self.unit, lam=solved.lam / self.unit)
+        compiled = self.compiled.solve(theta, sets) if self.compiled is not None and self.engine != "daqp" else None
+        solved = self._solve_generally(theta, sets) if compiled is None else self._completed(*compiled, theta, sets)
         report_failures(solved.info, on_failure)
         planned = Planned(*self.sizes.split(solved.v), solved.lam, solved.active, solved.info)
         if sets.is_box:
             return planned
         return planned._replace(du=solved.v[..., self.sizes.u + self.sizes.y :], weak=solved.weak)
+
+    def _solve_generally(self, theta: Tensor, sets: Sets) -> Solved:
+        """Solve by engines, judge, second look and certificate, whatever the problem."""
+        check_finite(theta, self.sizes)
+        solved = self.in_units._solve_flat(theta, in_units(sets, self.unit))
+        return solved._replace(v=solved.v * self.unit, lam=solved.lam / self.unit)
+
+    def _completed(self, solved: Solved, convinces: Tensor, theta: Tensor, sets: Sets) -> Solved:
+        """Solve the samples again that do not convince."""
+        if bool(convinces.all()):
+            return solved
+        if convinces.ndim != 1 or not (isinstance(sets, Bounds) or not sets.batch_shape):
+            return self._solve_generally(theta, sets)
+        rest = (~convinces).nonzero()[:, 0]
+        part = sets.of_samples(rest) if isinstance(sets, Bounds) else sets
+        solved.put(rest, self._solve_generally(theta[rest], part))
+        return solved
 
     def jacobian(self, planned: Planned, sets: Sets) -> Blocks:
         """Return D, the Jacobian of the projection at a solution, as :class:`ProjectedSystem` takes it."""
