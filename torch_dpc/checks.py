@@ -1,10 +1,10 @@
-"""The checks at the door: what came, what was asked for, in words."""
+"""Argument validation: each error gives the name, the rule and what came."""
 
 from __future__ import annotations
 
 import math
 import operator
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from typing import Any
 
 import numpy as np
@@ -73,6 +73,97 @@ def check_count(name: str, value: Any) -> int:
     if count < 1:
         raise ValueError(f"{rule}, got {value!r}.")
     return count
+
+
+def check_number(
+    name: str, value: Any, *, positive: bool = False, finite: bool = True, kind: str | None = None
+) -> float:
+    """Return a number that is not negative, NumPy's and torch's included.
+
+    Args:
+        name: what the caller calls it; the error says so.
+        value: the number.
+        positive: zero is not admitted.
+        finite: infinity is not admitted.
+        kind: what it must be, in words of the caller's.
+
+    Raises:
+        ValueError: anything else.
+    """
+    kind = kind or ("finite and " if finite else "") + ("positive" if positive else "not negative")
+    rule = f"`{name}` must be {kind}"
+    is_bool = isinstance(value, (bool, np.bool_)) or getattr(value, "dtype", None) is torch.bool
+    try:
+        number = math.nan if is_bool or isinstance(value, (str, bytes)) else float(value)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{rule}, got {value!r}.") from error
+    if not (number > 0 if positive else number >= 0) or (finite and math.isinf(number)):
+        raise ValueError(f"{rule}, got {value!r}.")
+    return number
+
+
+def as_numbers(name: str, value: Any) -> Tensor:
+    """Return a number or an array of numbers as a float64 tensor, with its graph; integers become floats.
+
+    Raises:
+        ValueError: no numbers, none at all, booleans or complex numbers.
+    """
+    rule = f"`{name}` must be a number or an array of numbers"
+    try:
+        tensor = torch.as_tensor(value)
+        if tensor.dtype is torch.bool or tensor.is_complex() or not tensor.numel():
+            raise TypeError
+        tensor = tensor.double() if isinstance(value, Tensor) else torch.as_tensor(value, dtype=torch.float64)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise ValueError(f"{rule}, got {value!r}.") from error
+    return tensor
+
+
+def check_type(name: str, value: Any, kind: type[Any] | tuple[type[Any], ...]) -> None:
+    """Raise ValueError unless a value is of one of some classes."""
+    if not isinstance(value, kind):
+        kinds = kind if isinstance(kind, tuple) else (kind,)
+        wanted = " or ".join(k.__name__ for k in kinds)
+        came = f"the class {value.__name__}: make an object of it" if isinstance(value, type) else type(value).__name__
+        raise ValueError(f"`{name}` must be a {wanted}, got {came}.")
+
+
+def check_generator(value: Any) -> None:
+    """Raise ValueError unless `generator` is a torch.Generator, a sequence of them, one a run, or None."""
+    each = value if isinstance(value, (list, tuple)) else [value]
+    if not all(isinstance(generator, (torch.Generator, type(None))) for generator in each):
+        raise ValueError(f"`generator` must be a torch.Generator, a list of one a run, or None, got {value!r}.")
+
+
+def check_batch(name: str, value: Any) -> tuple[int, ...]:
+    """Return a batch shape, given as a number or as a sequence of numbers.
+
+    Raises:
+        ValueError: no counts.
+    """
+    rule = f"`{name}` must be a number of runs or a shape"
+    sizes = value if isinstance(value, Sequence) and not isinstance(value, str) else [value]
+    shape = tuple(as_index(rule, size) for size in sizes)
+    if any(size < 0 for size in shape):
+        raise ValueError(f"{rule}, got {value!r}.")
+    return shape
+
+
+def check_callable(name: str, value: Any, *, optional: bool = False) -> None:
+    """Raise ValueError unless a value can be called, or is None where that is admitted."""
+    if not callable(value) and not (optional and value is None):
+        raise ValueError(f"`{name}` must be callable{' or None' if optional else ''}, got {type(value).__name__}.")
+
+
+def check_flag(name: str, value: Any) -> bool:
+    """Return True or False.
+
+    Raises:
+        ValueError: anything else.
+    """
+    if not isinstance(value, (bool, np.bool_)):
+        raise ValueError(f"`{name}` must be True or False, got {value!r}.")
+    return bool(value)
 
 
 def window(name: str, value: Any, steps: int, channels: int, symbol: str) -> Tensor:

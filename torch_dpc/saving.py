@@ -22,7 +22,7 @@ import torch
 from torch import Tensor, nn
 from torch.nn.utils import parametrize
 
-from .checks import as_data
+from .checks import as_data, check_flag, check_type
 from .data.hankel import HankelData
 from .data.row_space import RowSpace, row_units
 from .files import write_whole
@@ -43,6 +43,8 @@ ENTRIES = {"version", "data", "arguments", CHECKSUM}
 def save_layer(layer: nn.Module, path: str | os.PathLike[str], *, data: bool = False) -> None:
     """Write a layer; see :meth:`torch_dpc.DPCLayer.save`."""
     torch_files = _safetensors()
+    check_flag("data", data)
+    check_type("path", path, (str, os.PathLike))
     text, tensors = layer_to_tree(layer, data=data)
     text[CHECKSUM] = _checksum(text, tensors)
     write_whole(path, torch_files.save(tensors, metadata={HEADER: json.dumps(text, allow_nan=False)}))
@@ -50,6 +52,7 @@ def save_layer(layer: nn.Module, path: str | os.PathLike[str], *, data: bool = F
 
 def load_layer(cls: type[Any], path: str | os.PathLike[str]) -> Any:
     """Read a layer of class `cls`; see :meth:`torch_dpc.DPCLayer.load`."""
+    check_type("path", path, (str, os.PathLike))
     text, tensors = _read(path)
     if text.get("version") != VERSION:
         raise ValueError(

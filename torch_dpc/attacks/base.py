@@ -7,7 +7,7 @@ from typing import Any, NamedTuple, Protocol
 import torch
 from torch import Tensor
 
-from ..checks import as_data
+from ..checks import as_data, check_generator, check_type
 from .budgets import Budget
 
 #: How far outside its budget a perturbation may be, relative to the size of the budget: rounding in float64.
@@ -42,6 +42,7 @@ class Attack:
     budget: Budget
 
     def __init__(self, budget: Budget):
+        check_type("budget", budget, Budget)
         self.budget = budget
 
     def __call__(
@@ -66,13 +67,21 @@ class Attack:
             ValueError: windows that are not finite, or shapes that do not fit.
             AssertionError: the answer is outside the budget by more than 1e-9 of its size; a defect of the attack.
         """
-        u_ini, y_ini = as_data("u_ini", u_ini), as_data("y_ini", y_ini)
+        u_ini, y_ini = _window("u_ini", u_ini), _window("y_ini", y_ini)
+        check_generator(generator)
         p = self._perturb(AttackCall(u_ini, y_ini, y_ref, u_ref, generator, step))
         return within_budget(p.to(y_ini.dtype), y_ini, self.budget)
 
     def _perturb(self, call: AttackCall) -> Tensor:
         """Return p, the shape of y_ini, in float64 or the dtype of y_ini."""
         raise NotImplementedError
+
+
+def _window(name: str, value: Any) -> Tensor:
+    tensor = as_data(name, value)
+    if tensor.ndim < 2:
+        raise ValueError(f"`{name}` must have shape (*batch, t_ini, n), got {tuple(tensor.shape)}.")
+    return tensor
 
 
 def within_budget(p: Tensor, y_ini: Tensor, budget: Budget) -> Tensor:

@@ -13,7 +13,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..checks import as_data, last_rows, to_horizon
+from ..checks import as_data, as_index, last_rows, to_horizon
 from ..data.hankel import HankelData
 from ..data.predictor import Predictor
 from ..problem.weights import weight_matrix
@@ -42,14 +42,23 @@ class TargetInput:
         name, value = ("u_target", u_target) if trajectory is None else ("trajectory", trajectory)
         self.target = as_data(name, value)
         self.moves = trajectory is not None
-        if self.target.ndim not in ((2,) if self.moves else (1, 2)):
-            raise ValueError(f"`{name}` has {self.target.ndim} dimensions, which is not among those it may have.")
+        self._name = name
+        if self.target.ndim not in ((2,) if self.moves else (1, 2)) or not self.target.numel():
+            wanted = "(>= steps, n_u)" if self.moves else "(n_u,) or (horizon, n_u)"
+            raise ValueError(f"`{name}` must have shape {wanted}, got {tuple(self.target.shape)}.")
 
     def at(self, step: int) -> Cost:
         """Return the cost of a plan made at a step of the run."""
+        if self.moves:
+            step = as_index("`step` must be an integer, 0 or more", step)
+            if step < 0:
+                raise ValueError(f"`step` must be an integer, 0 or more, got {step}.")
 
         def psi(solution: DPCSolution) -> Tensor:
             target = self.rows_at(step, solution.u.shape[-2]).to(solution.u)
+            if target.shape[-1] != solution.u.shape[-1]:
+                came = f"{target.shape[-1]} channels for plans of {solution.u.shape[-1]}"
+                raise ValueError(f"`{self._name}` must have one value for each input, got {came}.")
             return 0.5 * (solution.u - target).square().sum((-2, -1))
 
         return psi
@@ -117,6 +126,13 @@ class TrackingError:
         raise ValueError(
             "`TrackingError` needs the unattacked window: call cost.given(u_ini=..., y_ini=..., y_ref=...)."
         )
+
+
+def check_cost(cost: Any, name: str = "cost") -> None:
+    """Raise ValueError unless a cost can be called, or made callable for a step or a window."""
+    if isinstance(cost, type) or not (callable(cost) or hasattr(cost, "at") or hasattr(cost, "given")):
+        came = f"the class {cost.__name__}: make an object of it" if isinstance(cost, type) else type(cost).__name__
+        raise ValueError(f"`{name}` must be a callable DPCSolution -> (*batch,), got {came}.")
 
 
 def at_step(cost: Any, step: int) -> Cost:

@@ -7,11 +7,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..checks import check_count
+from ..checks import check_callable, check_count, check_number
 from ..layer import DPCLayer
 from .base import Attack, AttackCall, Planner
 from .budgets import Budget
 from .budgets.base import direction, euclidean
+from .costs import check_cost
 from .loop import SETTINGS, IterativeAttack, Walk, algorithm_1_step
 from .objective import Objective
 
@@ -51,6 +52,8 @@ class LinearizedAttack(Attack):
 
     def __init__(self, layer: DPCLayer, cost: Any, budget: Budget, *, iterations: int = 1, keeps_graph: bool = False):
         super().__init__(budget)
+        check_callable("layer", layer)
+        check_cost(cost)
         self.layer, self.cost = layer, cost
         self.iterations, self.keeps_graph = check_count("iterations", iterations), keeps_graph
 
@@ -101,9 +104,8 @@ class ProjectedGradientAttack(IterativeAttack):
         restarts: int = 1,
     ):
         super().__init__(layer, cost, budget, steps, restarts=restarts)
-        if not step_size > 0:
-            raise ValueError(f"`step_size` must be positive, got {step_size!r}.")
-        if not 0 <= momentum < 1:
+        check_number("step_size", step_size, positive=True, kind="positive and finite")
+        if not check_number("momentum", momentum) < 1:
             raise ValueError(f"`momentum` must be at least 0 and below 1, got {momentum!r}.")
         self.step_size, self.momentum = step_size, momentum
 

@@ -12,8 +12,10 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..checks import check_callable
 from .base import Attack, AttackCall, Planner
 from .budgets import Budget
+from .costs import check_cost
 from .objective import Objective
 
 
@@ -111,6 +113,8 @@ class IterativeAttack(Attack):
         if not isinstance(restarts, int) or isinstance(restarts, bool) or restarts < 1:
             raise ValueError(f"`restarts` must be an integer, 1 or more, got {restarts!r}.")
         super().__init__(budget)
+        check_callable("layer", layer)
+        check_cost(cost)
         self.layer, self.cost = layer, cost
         self.steps, self.restarts = steps, restarts
 

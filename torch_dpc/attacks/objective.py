@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..checks import as_data, last_rows, to_horizon
+from ..checks import as_data, check_type, last_rows, to_horizon
 from ..errors import Status
 from ..layer import DPCLayer
 from ..solution import DPCSolution, SolveInfo
@@ -98,6 +98,7 @@ class Objective:
 
     def _judged(self, plan: Any) -> Tensor:
         psi = self.cost(plan)
+        check_type("cost", psi, Tensor)
         if psi.shape != self.batch:
             raise ValueError(f"`cost` must return one number a sample, {tuple(self.batch)}, got {tuple(psi.shape)}.")
         return psi

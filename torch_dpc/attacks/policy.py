@@ -11,7 +11,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
-from ..checks import as_data, check_count, is_finite, reference, window
+from ..checks import as_data, check_callable, check_count, check_type, is_finite, reference, window
 from ..data.hankel import HankelData
 from .base import Attack, AttackCall
 from .budgets import BallBudget, Budget, EllipsoidBudget
@@ -60,6 +60,8 @@ class AttackPolicy(nn.Module):
         generator: torch.Generator | None = None,
     ):
         super().__init__()
+        check_type("data", data, HankelData)
+        check_type("hidden", hidden, (list, tuple))
         for name, count in (("looks", looks), *(("hidden", width) for width in hidden)):
             check_count(name, count)
         if context is not None and (context := as_data("context", context).double()).ndim != 2:
@@ -176,6 +178,8 @@ class PolicyAttack(nn.Module, Attack):
 
     def __init__(self, policy: nn.Module, budget: Budget, *, reach: str | None = None):
         nn.Module.__init__(self)
+        check_callable("policy", policy)
+        check_type("budget", budget, Budget)
         if reach not in (None, "support", "projection"):
             raise ValueError(f'`reach` must be "support", "projection" or None, got {reach!r}.')
         self.policy = policy

@@ -14,11 +14,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..checks import check_count
+from ..checks import check_callable, check_count, check_number
 from ..layer import DPCLayer
 from .base import Attack, AttackCall, Planner
 from .budgets import Budget
 from .budgets.base import standard_normal
+from .costs import check_cost
 from .gradient import ProjectedGradientAttack
 from .loop import improves
 from .objective import Objective, is_everyone
@@ -34,6 +35,7 @@ class BlackBox:
     """A controller that is only asked, and how often: `n_queries` windows so far."""
 
     def __init__(self, controller: Planner):
+        check_callable("controller", controller)
         self._controller: Callable[..., Any] = controller
         self._options = {"on_failure": "nan"} if isinstance(controller, DPCLayer) else {}
         self.n_queries = 0
@@ -160,8 +162,7 @@ class FiniteDifferenceAttack(ProjectedGradientAttack):
     ):
         self.controller = BlackBox(controller)
         super().__init__(self.controller, cost, budget, steps, **options)
-        if not probe > 0:
-            raise ValueError(f"`probe` must be positive, got {probe!r}.")
+        check_number("probe", probe, positive=True, kind="positive and finite")
         if directions is not None:
             check_count("directions", directions)
         self.probe, self.directions = probe, directions
@@ -198,6 +199,7 @@ class RandomSearchAttack(Attack):
 
     def __init__(self, controller: Planner, cost: Any, budget: Budget, queries: int = 100):
         check_count("queries", queries)
+        check_cost(cost)
         super().__init__(budget)
         self.controller, self.cost, self.queries = BlackBox(controller), cost, queries
 

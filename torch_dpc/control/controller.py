@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..checks import as_data, as_index
+from ..checks import as_data, as_index, check_number, check_type
 from ..errors import Status
 from ..layer import DPCLayer
 from ..solution import DPCSolution
@@ -81,6 +81,7 @@ class DPCController:
         soft_weight: float = 1e6,
         deadline: float | None = None,
     ):
+        check_type("layer", layer, DPCLayer)
         horizon = layer.data.horizon
         if replan_every is None:
             replan_every = min(10, horizon)
@@ -92,8 +93,7 @@ class DPCController:
             raise ValueError(f'`on_failure` must be "raise", "hold" or "soften", got {on_failure!r}.')
         if on_failure == "soften" and not layer.feasible_set.is_box:
             raise ValueError('`on_failure="soften"` widens boxes; give the layer a SoftBox as `y_set` instead.')
-        if not soft_weight > 0:
-            raise ValueError(f"`soft_weight` must be positive, got {soft_weight!r}.")
+        check_number("soft_weight", soft_weight, positive=True, kind="positive and finite")
         self.layer = layer
         self.replan_every = replan_every
         self.on_failure = on_failure

@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..checks import as_data
 from ..systems.plant import Port
 from .controller import DPCController
 from .past import Past
@@ -81,11 +82,20 @@ class Loop:
         ahead = slice(k, k + self.data.horizon)
         refs = {"y_ref": self.y_refs[..., ahead, :], "u_ref": self.u_refs[..., ahead, :]}
         if self.attack is not None and self.controller.replans_now:
-            self.p = self.attack(u_ini, y_ini, **refs, generator=self.generator, step=k)
+            self.p = self._checked(self.attack(u_ini, y_ini, **refs, generator=self.generator, step=k), y_ini)
         u = self.controller.step(u_ini, y_ini + self.p, **refs)
         self.past.append(u, self.y)
         self.y = self.port.step(u)
         return u
+
+
+    @staticmethod
+    def _checked(p: Any, y_ini: Tensor) -> Tensor:
+        """Return what an attack adds, which a callable of one's own may have wrong."""
+        p = as_data("what `attack` returns", p)
+        if p.shape != y_ini.shape:
+            raise ValueError(f"`attack` must return the shape of y_ini, {tuple(y_ini.shape)}, got {tuple(p.shape)}.")
+        return p
 
 
 def side_by_side(attacks: Sequence[Attack]) -> Attack:

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from ..checks import check_count
+from ..checks import check_callable, check_count, check_generator, check_type
 from ..systems.plant import Plant, Port, per_input
 from .checkpoints import advance_with_checkpoints
 from .controller import DPCController
@@ -80,17 +80,24 @@ def simulate(
         (torch.Size([8, 20, 4]), torch.Size([20, 4]))
     """
     check_count("steps", steps)
+    check_type("controller", controller, DPCController)
+    check_generator(generator)
+    check_callable("progress", progress, optional=True)
     data, port = controller.layer.data, Port(plant)
     if (port.n_u, port.n_y) != (data.n_u, data.n_y):
         raise ValueError(
-            f"the plant has {port.n_u} inputs and {port.n_y} outputs, the controller's data {data.n_u} and {data.n_y}."
+            f"`plant` has {port.n_u} inputs and {port.n_y} outputs, which must be those of the controller's data, "
+            f"{data.n_u} and {data.n_y}."
         )
     y_refs = reference_trajectory("y_ref", y_ref, steps, data.n_y, data.horizon)
     u_refs = reference_trajectory(
         "u_ref", torch.zeros(data.n_u) if u_ref is None else u_ref, steps, data.n_u, data.horizon
     )
     controller.reset()
-    attack = side_by_side(attack) if isinstance(attack, Sequence) else attack
+    if isinstance(attack, str) or not isinstance(attack, Sequence):
+        check_callable("attack", attack, optional=True)
+    else:
+        attack = side_by_side(attack)
     loop = Loop(port, controller, y_refs, u_refs, attack, generator)
     loop.warm_up(_with_batch(plant, reset, batch), per_input("u_warmup", u_warmup, data.n_u))
     _check_batches(loop, batch)

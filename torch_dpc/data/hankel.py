@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from .. import plot
-from ..checks import check_count
+from ..checks import as_data, as_index, check_count, check_type
 from .csv import Source, read_csv
 from .rank import excitation_order, has_full_row_rank, relative_tolerance, warn_of_excitation
 from .recordings import as_recordings, hankel
@@ -68,6 +68,20 @@ class HankelData:
     n_y: int
     windows_seen: int | None = None
     recorded_as: torch.dtype | None = None
+
+    def __post_init__(self) -> None:
+        sizes = {name: check_count(name, getattr(self, name)) for name in ("t_ini", "horizon", "n_u", "n_y")}
+        if self.windows_seen is not None and as_index("`windows_seen` must be a count or None", self.windows_seen) < 0:
+            raise ValueError(f"`windows_seen` must be a count or None, got {self.windows_seen!r}.")
+        columns = self.Up.shape[-1] if isinstance(self.Up, Tensor) and self.Up.ndim else None
+        for name in ("Up", "Uf", "Yp", "Yf"):
+            matrix = getattr(self, name)
+            check_type(name, matrix, Tensor)
+            as_data(name, matrix)
+            steps, channels = ("t_ini" if name[1] == "p" else "horizon"), f"n_{name[0].lower()}"
+            if matrix.shape != (sizes[steps] * sizes[channels], columns):
+                wanted = f"({steps} {channels}, n_g) = ({sizes[steps] * sizes[channels]}, {columns})"
+                raise ValueError(f"`{name}` must have shape {wanted}, got {tuple(matrix.shape)}.")
 
     @classmethod
     def from_trajectories(cls, u: Any, y: Any, *, t_ini: int, horizon: int) -> HankelData:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import warnings
+from collections.abc import Sequence
 
 import torch
 from torch import Tensor
 
+from ..checks import as_data
 from ..errors import ExcitationWarning
 from .recordings import hankel
 
@@ -33,6 +35,11 @@ def excitation_order(recordings: list[Tensor]) -> int:
         >>> excitation_order([u]), excitation_order([torch.ones(9, 1)])
         (3, 1)
     """
+    if isinstance(recordings, str) or not isinstance(recordings, Sequence) or not recordings:
+        raise ValueError(f"`recordings` must be a list of tensors (T, n_u), got {recordings!r}.")
+    recordings = [as_data(f"recordings[{i}]", w) for i, w in enumerate(recordings)]
+    if any(w.ndim != 2 for w in recordings):
+        raise ValueError(f"`recordings` must have shape (T, n_u), got {[tuple(w.shape) for w in recordings]}.")
     low, high = 0, max(recording.shape[0] for recording in recordings)
     while low < high:  # full row rank at depth L implies it at every smaller depth: bisect
         middle = (low + high + 1) // 2

@@ -141,9 +141,13 @@ class ConvexSet(nn.Module):
             name: of the set, for messages.
             steps, channels: of the plan.
         """
-        for owner, places in self.parts(steps, channels):
+        fits = f"`{name}` does not fit {channels} channels over {steps} steps"
+        try:
+            parts = self.parts(steps, channels)
+        except ValueError as error:
+            raise ValueError(f"{fits}: {error}") from error
+        for owner, places in parts:
             x = torch.zeros(places.shape, dtype=torch.float64)
-            fits = f"`{name}` does not fit {channels} channels over {steps} steps"
             try:
                 shapes = [owner.project(x).shape, owner.prox(x, x.new_ones(*x.shape[:-1], 1)).shape]
             except (RuntimeError, ValueError, TypeError, IndexError) as error:

@@ -177,8 +177,13 @@ class SoftBox(ConvexSet):
     def check_values(self) -> None:
         self.box.check_values()
         # NaN is not positive either.
-        if not is_mapped(self.weight) and not bool((as_tensor(self.weight).detach() > 0).all()):
+        if is_mapped(self.weight):
+            return
+        weight = as_tensor(self.weight).detach()
+        if not bool((weight > 0).all()):
             raise ValueError("`weight` must be positive: without a price there is no bound.")
+        if not bool(torch.isfinite(weight).all()):
+            raise ValueError("`weight` must be finite: an infinite price is that of a Box.")
 
     def project(self, x: Tensor) -> Tensor:
         return self.box.project(x)

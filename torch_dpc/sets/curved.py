@@ -39,7 +39,7 @@ class Ball(ConvexSet):
         if not bool((value >= 0).all()) or not bool(torch.isfinite(value).all()):
             raise ValueError("`radius` must be finite and not negative.")
         if not bool(torch.isfinite(as_tensor(self.center).detach()).all()):
-            raise ValueError("`center` must be finite.")
+            raise ValueError("`center` must be finite in every channel.")
 
     def _polar(self, x: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return center, direction, distance and radius; the direction is 0 at the center."""

@@ -14,6 +14,8 @@ from ..autodiff import is_mapped
 def as_bound(name: str, value: Any) -> Tensor | float:
     """Keep a floating tensor as it is; anything else becomes a float or a float64 tensor."""
     if isinstance(value, Tensor):
+        if not value.numel():
+            raise ValueError(f"`{name}` must be a number or an array of numbers, got shape {tuple(value.shape)}.")
         if not value.is_floating_point():
             raise ValueError(f"`{name}` must hold floating-point numbers, got {value.dtype}.")
         return value
@@ -22,7 +24,7 @@ def as_bound(name: str, value: Any) -> Tensor | float:
         is_bool = torch.as_tensor(value).dtype == torch.bool
     except (TypeError, ValueError, RuntimeError) as error:
         raise ValueError(f"`{name}` must be a number or an array of numbers, got {value!r}.") from error
-    if is_bool:
+    if is_bool or not tensor.numel():
         raise ValueError(f"`{name}` must be a number or an array of numbers, got {value!r}.")
     return tensor.item() if tensor.ndim == 0 else tensor
 

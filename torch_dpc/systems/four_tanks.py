@@ -9,7 +9,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..checks import as_data
+from ..checks import as_data, check_number
 from .ode import Ode
 
 GRAVITY = 981.0  # [cm/s^2]
@@ -87,6 +87,7 @@ class FourTanks(Ode):
     ):
         if phase not in OPERATING_POINTS:
             raise ValueError(f"`phase` must be one of {', '.join(OPERATING_POINTS)}, got {phase!r}.")
+        check_number("dt", dt, positive=True, kind="a positive sampling time [s]")
         point = OPERATING_POINTS[phase]
         self.phase = phase
         self._area, self._outlet = torch.tensor(AREA).double(), torch.tensor(OUTLET, dtype=torch.float64)

@@ -7,6 +7,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
+from ..checks import check_count, check_number
 from .state_space import StateSpace, discretise
 
 
@@ -44,11 +45,11 @@ class OscillatingMasses(StateSpace):
         noise: float = 0.0,
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
     ):
-        if not (masses >= 1 and dt > 0 and mass > 0 and spring > 0 and damping >= 0 and noise >= 0):
-            raise ValueError(
-                "`masses`, `dt`, `mass` and `spring` must be positive, `damping` and `noise` not negative, got "
-                f"{masses}, {dt}, {mass}, {spring}, {damping}, {noise}."
-            )
+        masses = check_count("masses", masses)
+        for name, value in (("dt", dt), ("mass", mass), ("spring", spring)):
+            check_number(name, value, positive=True)
+        for name, value in (("damping", damping), ("noise", noise)):
+            check_number(name, value)
         A, B = discretise(*_continuous(masses, mass, spring, damping), dt)
         super().__init__(A, B, dt=dt, measurement_noise=noise, generator=generator)
 

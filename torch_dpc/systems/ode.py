@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..checks import check_count
+from ..checks import check_callable, check_count, check_type
 from .torch_plant import TorchPlant
 
 #: f(x, u) or h(x, u): (*batch, n_x) and (*batch, n_u) to (*batch, n).
@@ -68,6 +68,8 @@ class Ode(TorchPlant):
         measurement_noise: Any = 0.0,
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
     ):
+        check_callable("f", f)
+        check_callable("h", h, optional=True)
         if method not in ("rk4", *ADAPTIVE):
             raise ValueError(f'`method` must be "rk4" or one of {", ".join(ADAPTIVE)}, got {method!r}.')
         if h is None and n_y not in (None, n_x):
@@ -110,6 +112,7 @@ class Ode(TorchPlant):
 
     def _slope(self, x: Tensor, u: Tensor) -> Tensor:
         slope = self.f(x, u)
+        check_type("f", slope, Tensor)
         if slope.shape != x.shape:
             raise ValueError(f"`f` must return shape (*batch, n_x) = {tuple(x.shape)}, got {tuple(slope.shape)}.")
         return slope
@@ -118,6 +121,7 @@ class Ode(TorchPlant):
         if self.h is None:
             return x
         y = self.h(x, u)
+        check_type("h", y, Tensor)
         if y.shape != (*x.shape[:-1], self.n_y):
             raise ValueError(
                 f"`h` must return shape (*batch, n_y) = {(*x.shape[:-1], self.n_y)}, got {tuple(y.shape)}."

@@ -10,7 +10,7 @@ from typing import Any, Protocol, runtime_checkable
 import torch
 from torch import Tensor
 
-from ..checks import as_data, check_count
+from ..checks import as_data, as_numbers, check_callable, check_count, check_flag, check_generator
 
 
 class Plant(Protocol):
@@ -101,6 +101,8 @@ class Port:
             u: input of one step that a plant without `measure()` makes if it is not reset, `(n_u,)`.
         """
         self.batch, self._steps = None, 0
+        if not isinstance(reset, Mapping):
+            check_flag("reset", reset)
         if isinstance(reset, Mapping):
             return self._accept(self.plant.reset(**reset), "from reset")
         if reset:
@@ -169,7 +171,11 @@ def collect(
     check_count("steps", steps)
     check_count("hold", hold)
     port = Port(plant)
+    check_callable("feedback", feedback, optional=True)
+    check_generator(generator)
     size = per_input("amplitude", amplitude, port.n_u)
+    if not bool((size >= 0).all()):
+        raise ValueError(f"`amplitude` must be zero or more, got {amplitude!r}.")
     centre = per_input("offset", 0.0 if offset is None else offset, port.n_u)
     y = port.start(reset, centre)
     assert port.batch is not None
@@ -192,7 +198,7 @@ def per_input(name: str, value: Any, n_u: int) -> Tensor:
     Raises:
         ValueError: another shape, or values that are not finite.
     """
-    tensor = as_data(name, torch.as_tensor(value, dtype=torch.float64))
+    tensor = as_data(name, as_numbers(name, value))
     if tensor.ndim and tensor.shape[-1] not in (1, n_u):
         raise ValueError(f"`{name}` must be a number or have shape (*batch, {n_u}), got {tuple(tensor.shape)}.")
     return tensor.expand(*tensor.shape[:-1], n_u)

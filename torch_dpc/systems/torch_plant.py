@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from ..batching import standard_normal
-from ..checks import as_data, check_count
+from ..checks import as_data, as_numbers, check_batch, check_count, check_generator, check_number
 
 
 class TorchPlant:
@@ -46,12 +46,11 @@ class TorchPlant:
         generator: torch.Generator | Sequence[torch.Generator] | None = None,
     ):
         self.n_x, self.n_u, self.n_y = check_count("n_x", n_x), check_count("n_u", n_u), check_count("n_y", n_y)
-        if not dt > 0:
-            raise ValueError(f"`dt` must be a positive sampling time [s], got {dt!r}.")
-        self.dt = float(dt)
+        self.dt = check_number("dt", dt, positive=True, kind="a positive sampling time [s]")
         self.x0 = torch.zeros(n_x, dtype=torch.float64) if x0 is None else self._vector("x0", x0, n_x)
         self.process_noise = _deviation("process_noise", process_noise, n_x)
         self.measurement_noise = _deviation("measurement_noise", measurement_noise, n_y)
+        check_generator(generator)
         self.generator = generator
         self.x, self._u = self.x0, torch.zeros(n_u, dtype=torch.float64)
 
@@ -66,7 +65,7 @@ class TorchPlant:
             ValueError: shapes that do not fit.
         """
         x = self.x0 if state is None else as_data("state", state).double()
-        shape = (batch,) if isinstance(batch, int) else tuple(batch)
+        shape = check_batch("batch", batch)
         if x.shape[-1:] != (self.n_x,) or (x.ndim > 1 and shape and x.shape[:-1] != shape):
             expected = f"({', '.join(map(str, shape))}, {self.n_x})" if shape else f"(*batch, {self.n_x})"
             raise ValueError(f"`state` must have shape ({self.n_x},) or {expected}, got {tuple(x.shape)}.")
@@ -123,7 +122,7 @@ class TorchPlant:
 
 
 def _deviation(name: str, value: Any, size: int) -> float | Tensor:
-    deviation = torch.as_tensor(value, dtype=torch.float64)
+    deviation = as_numbers(name, value)
     if deviation.shape not in ((), (size,)) or not bool((deviation >= 0).all()):
         raise ValueError(f"`{name}` must be a number or have shape ({size},), not negative, got {value!r}.")
     return float(deviation) if deviation.ndim == 0 else deviation

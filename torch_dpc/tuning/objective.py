@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -11,9 +10,9 @@ import torch
 from torch import Tensor
 
 from ..attacks.budgets import Budget
-from ..attacks.costs import Cost
+from ..attacks.costs import Cost, check_cost
 from ..attacks.gradient import LinearizedAttack
-from ..checks import as_data, check_count
+from ..checks import as_data, check_callable, check_count, check_number, check_type
 from ..data.predictor import Predictor
 from ..errors import Status
 from ..factors import Factored
@@ -39,6 +38,15 @@ class Windows:
     y_ini: Tensor
     y_ref: Tensor
     u_ref: Tensor | None = None
+
+    def __post_init__(self) -> None:
+        past = [as_data(name, getattr(self, name)) for name in ("u_ini", "y_ini")]
+        if any(w.ndim != 3 for w in past) or past[0].shape[:2] != past[1].shape[:2]:
+            came = " and ".join(str(tuple(w.shape)) for w in past)
+            raise ValueError(f"`windows` must hold u_ini and y_ini of shape (B, t_ini, n), of one B, got {came}.")
+        as_data("y_ref", self.y_ref)
+        if self.u_ref is not None:
+            as_data("u_ref", self.u_ref)
 
 
 class RobustObjective:
@@ -90,6 +98,13 @@ class RobustObjective:
         iterations: int = 1,
         attack: AttackMaker | None = None,
     ):
+        check_type("layer", layer, DPCLayer)
+        check_type("windows", windows, Windows)
+        check_type("budget", budget, Budget)
+        for name, value in (("predictor", predictor), ("cost", cost), ("attack", attack)):
+            check_callable(name, value, optional=True)
+        if psi is not None:
+            check_cost(psi, "psi")
         horizon = layer.data.horizon
         replan_every = horizon if replan_every is None else replan_every
         check_count("plans", plans)
@@ -101,8 +116,7 @@ class RobustObjective:
             raise ValueError(f'`through` must be "danskin" or "attack", got {through!r}.')
         if attack is not None and through != "danskin":
             raise ValueError('an `attack` of your own has no derivative here: take `through="danskin"`.')
-        if not (math.isfinite(attacked_weight) and attacked_weight >= 0):
-            raise ValueError(f"`attacked_weight` must be finite and not negative, got {attacked_weight!r}.")
+        check_number("attacked_weight", attacked_weight)
         self.layer, self.budget, self.psi, self.attack = layer, budget, psi, attack
         self.plans, self.replan_every, self.iterations = plans, replan_every, iterations
         self.attacked_weight, self.through = attacked_weight, through

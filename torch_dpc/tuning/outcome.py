@@ -7,6 +7,8 @@ from typing import Any
 
 from torch import Tensor
 
+from ..checks import as_data, as_index, check_type
+
 #: What inputs do from a window on: (u_ini, y_ini, u) -> y, all `(*batch, steps, n)`. A
 #: :class:`torch_dpc.attacks.Predictor` is one. Its data should not be those of the layer: a layer with a large lambda_g
 #: plans with the predictor of its own data, and would be judged by its own model.
@@ -29,7 +31,11 @@ class MeanError:
     SMOOTH = 1e-6
 
     def __init__(self, channels: Sequence[int]):
-        self.channels = list(channels)
+        check_type("channels", channels, (list, tuple, range))
+        rule = "`channels` must be integers, 0 or more, at least one"
+        self.channels = [as_index(rule, channel) for channel in channels]
+        if not self.channels or min(self.channels) < 0:
+            raise ValueError(f"{rule}, got {channels!r}.")
 
     def __call__(self, u: Any, y: Tensor, u_ref: Any, y_ref: Tensor) -> Tensor:
         """Return the error, `(*batch,)`."""
@@ -45,10 +51,17 @@ class QuadraticCost:
     """
 
     def __init__(self, Q: Tensor, R: Tensor):
-        self.Q, self.R = Q, R
+        self.Q, self.R = (_square(name, weight) for name, weight in (("Q", Q), ("R", R)))
 
     def __call__(self, u: Tensor, y: Tensor, u_ref: Tensor, y_ref: Tensor) -> Tensor:
         """Return the cost, `(*batch,)`."""
         of_y = (((y - y_ref) @ self.Q) * (y - y_ref)).sum(-1)
         of_u = (((u - u_ref) @ self.R) * (u - u_ref)).sum(-1)
         return 0.5 * (of_y + of_u).mean(-1)
+
+
+def _square(name: str, weight: Any) -> Tensor:
+    weight = as_data(name, weight)
+    if weight.ndim != 2 or weight.shape[0] != weight.shape[1]:
+        raise ValueError(f"`{name}` must be the weight of one step, (n, n), got {tuple(weight.shape)}.")
+    return weight

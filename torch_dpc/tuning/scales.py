@@ -7,6 +7,7 @@ from typing import Any
 import torch
 from torch import Tensor, nn
 
+from ..checks import check_type
 from ..layer import DPCLayer
 from ..problem.weights import as_weight
 
@@ -25,6 +26,7 @@ class WeightScales(nn.Module):
 
     def __init__(self, layer: DPCLayer):
         super().__init__()
+        check_type("layer", layer, DPCLayer)
         data = layer.data
         self.lambda_g = nn.Parameter(torch.zeros((), dtype=torch.float64))
         self.lambda_s = nn.Parameter(torch.zeros((), dtype=torch.float64))

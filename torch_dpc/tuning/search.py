@@ -9,7 +9,7 @@ from dataclasses import dataclass
 
 import torch
 
-from ..checks import check_count
+from ..checks import check_callable, check_count, check_number, check_type
 from ..layer import DPCLayer
 from .objective import RobustObjective
 from .scales import WeightScales
@@ -56,10 +56,19 @@ def tune(
     Raises:
         ValueError: no objectives, or a start at which the objective is not finite.
     """
-    objectives = [objectives] if isinstance(objectives, RobustObjective) else list(objectives)
+    objectives = [objectives] if isinstance(objectives, RobustObjective) else objectives
+    check_type("objectives", objectives, (list, tuple))
+    for objective in objectives:
+        check_type("objectives", objective, RobustObjective)
     if not objectives:
         raise ValueError("`objectives` must hold at least one RobustObjective, got none.")
     check_count("steps", steps)
+    for name, value in (("lr", lr), ("limit", limit)):
+        check_number(name, value, positive=True)
+    check_number("seconds", seconds, finite=False)
+    check_callable("progress", progress, optional=True)
+    if scales is not None:
+        check_type("scales", scales, WeightScales)
     scales = WeightScales(objectives[0].layer) if scales is None else scales
     free = [s for s in scales.parameters() if s.requires_grad]
     optimiser = torch.optim.Adam(free, lr=lr)

@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ... import batching
+from ...checks import as_numbers
 
 
 class NormBound(NamedTuple):
@@ -102,7 +103,7 @@ def norm_bound(scale: Tensor) -> list[NormBound]:
 
 def nonnegative(name: str, value: Any) -> Tensor:
     """Return a size as a float64 tensor, with its graph, or say what is wrong with it."""
-    tensor = value.double() if isinstance(value, Tensor) else torch.as_tensor(value, dtype=torch.float64)
+    tensor = as_numbers(name, value)
     if not bool((tensor >= 0).all()) or not bool(torch.isfinite(tensor).all()):
         raise ValueError(f"`{name}` must be finite and not negative, got {value!r}.")
     return tensor

@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...checks import check_flag
 from .base import Budget, NormBound, direction, euclidean, nonnegative, norm_bound, ratio
 
 
@@ -22,7 +23,7 @@ class BoxBudget(Budget):
 
     def __init__(self, radius: Any, *, relative: bool = False):
         self.radius = _sizes("radius", radius)
-        self.relative = relative
+        self.relative = check_flag("relative", relative)
 
     def minimize_linear(self, c: Tensor, y_ini: Tensor) -> Tensor:
         return -self._reach(y_ini) * c.sign()
@@ -40,7 +41,7 @@ class BoxBudget(Budget):
         return [NormBound(rows[i : i + 1], np.zeros(1), radius) for i, radius in enumerate(reach)]
 
     def _reach(self, y_ini: Tensor) -> Tensor:
-        radius = self.radius.to(y_ini)
+        radius = _fitting("radius", self.radius, y_ini)
         if not self.relative:
             return radius
         dims = _shared(radius)
@@ -58,7 +59,7 @@ class EllipsoidBudget(Budget):
 
     def __init__(self, scale: Any, *, relative: bool = False):
         self.scale = _sizes("scale", scale)
-        self.relative = relative
+        self.relative = check_flag("relative", relative)
 
     def minimize_linear(self, c: Tensor, y_ini: Tensor) -> Tensor:
         scale = self._reach(y_ini)
@@ -85,7 +86,7 @@ class EllipsoidBudget(Budget):
         return norm_bound(self._reach(y_ini.double()).expand(y_ini.shape))
 
     def _reach(self, y_ini: Tensor) -> Tensor:
-        scale = self.scale.to(y_ini)
+        scale = _fitting("scale", self.scale, y_ini)
         if not self.relative:
             return scale
         dims = _shared(scale)
@@ -95,6 +96,15 @@ class EllipsoidBudget(Budget):
 def _shared(size: Tensor) -> tuple[int, ...]:
     """Return the dimensions of a window whose entries share one size."""
     return ((-2, -1), (-2,), ())[size.ndim]
+
+
+def _fitting(name: str, size: Tensor, y_ini: Tensor) -> Tensor:
+    """Return sizes in the precision of a window, whose steps and channels they must fit."""
+    wanted = y_ini.shape[y_ini.ndim - size.ndim :]
+    if any(n not in (1, m) for n, m in zip(size.shape, wanted, strict=True)):
+        came = f"{tuple(size.shape)} for windows of {tuple(y_ini.shape[-2:])}"
+        raise ValueError(f"`{name}` must broadcast to (t_ini, n_y), got {came}.")
+    return size.to(y_ini)
 
 
 def _sizes(name: str, value: Any) -> Tensor:

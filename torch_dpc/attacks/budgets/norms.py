@@ -8,6 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from ...checks import check_flag
 from .base import Budget, NormBound, direction, euclidean, nonnegative, norm_bound, ratio, standard_normal
 
 
@@ -23,7 +24,7 @@ class NormBall(Budget):
 
     def __init__(self, radius: Any, *, relative: bool = False):
         self.radius = nonnegative(self._name, radius)
-        self.relative = relative
+        self.relative = check_flag("relative", relative)
 
     def excess(self, p: Tensor, y_ini: Tensor) -> Tensor:
         return ratio(self._norm(p), self._reach(y_ini))[..., 0, 0] - 1
