@@ -16,6 +16,7 @@ import torch
 from torch import Tensor
 
 import torch_dpc as dpc
+from scripts.experiments.scenario import FIGURE, Scenario
 from scripts.shared.statistics import NOMINAL, POISON, RANDOM
 
 ATTACK_SEED = 1000  # the noise of seed s is drawn from ATTACK_SEED + s, the same directions at every rho
@@ -102,15 +103,29 @@ class Case:
         """Return what the paper's attacker wants."""
         raise NotImplementedError
 
-    def simulate(self, plant: Any, layer: dpc.DPCLayer, seed: int, attack: Any) -> dpc.ClosedLoopLog:
-        """Run the plant under the layer; the seed draws the noise."""
+    def simulate(
+        self, plant: Any, layer: dpc.DPCLayer, seed: int, attack: Any, scenario: Scenario = FIGURE
+    ) -> dpc.ClosedLoopLog:
+        """Run the plant under the layer; the seed draws the noise, the start and the pushes of a scenario."""
+        raise NotImplementedError
+
+    def wanted_inputs(self) -> Tensor:
+        """Return the inputs that the paper's attacker wants of each step, `(steps + horizon, n_u)`."""
         raise NotImplementedError
 
     def columns(self, plant: Any, log: dpc.ClosedLoopLog) -> dict[str, Any]:
         """Return a run's inputs and outputs by name, and where it has no plan."""
         raise NotImplementedError
 
+    def middle(self) -> Tensor:
+        """Return the output about which a changing reference is halved, `(n_y,)`."""
+        raise NotImplementedError
+
     # --- what all have in common --------------------------------------------------------------------------------------
+
+    def references_in(self, scenario: Scenario, steps: int) -> tuple[Tensor, Tensor | None]:
+        """Return y_ref and u_ref of a scenario, `(steps, n)`."""
+        return scenario.references(*self.references(steps), self.steps, self.middle())
 
     @property
     def rho(self) -> float:
@@ -162,7 +177,10 @@ class Case:
 
     def run(self, plant: Any, layer: dpc.DPCLayer, seed: int, kind: str, rho: float) -> Run:
         """Run in closed loop and sum up."""
-        log = self.simulate(plant, layer, seed, self.attack(kind, rho, layer))
+        return self.summed_up(self.simulate(plant, layer, seed, self.attack(kind, rho, layer)))
+
+    def summed_up(self, log: dpc.ClosedLoopLog) -> Run:
+        """Return the errors of a run and its plans without a solution."""
         error = self.error(log)
         unsolved = (log.status != dpc.Status.SOLVED)[:: self.replan_every].sum()
         return Run(float(error.mean()), float(error.max()), int(unsolved))

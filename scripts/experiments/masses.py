@@ -18,6 +18,7 @@ from torch import Tensor
 import torch_dpc as dpc
 from scripts.experiments.case import ATTACK_SEED, Case
 from scripts.experiments.closed_loops import HELD_OUT, TRAINING, Windows, closed_loops, drawn
+from scripts.experiments.scenario import FIGURE, Pushed, Scenario, start_generator
 from torch_dpc import attacks
 
 
@@ -55,6 +56,8 @@ class Masses(Case):
     u_ref: tuple[float, ...] = (1.0, 1.0)  # [N]: the input that holds y_ref, so that the nominal error is 0
     noise: float = 0.0  # [m, m/s]: standard deviation, of every measured output
     start_spread: float = 0.1  # [m, m/s]: standard deviation of disturbed initial states; Figure 3 starts at y_ref
+    random_start: float = 0.5  # [m, m/s]: the same, of the scenario that starts anywhere
+    push: float = 0.3  # [N]: standard deviation of a push
 
     # --- the closed loop ----------------------------------------------------------------------------------------------
 
@@ -70,24 +73,40 @@ class Masses(Case):
         y_ref, u_ref = (torch.tensor(value, dtype=torch.float64) for value in (self.y_ref, self.u_ref))
         return y_ref.expand(steps, -1), u_ref.expand(steps, -1)
 
+    def middle(self) -> Tensor:
+        return torch.zeros(4, dtype=torch.float64)
+
     def state(self, generator: torch.Generator) -> Tensor:
         """Return the state at which a run starts, `(4,)`."""
         return torch.tensor(self.y_ref, dtype=torch.float64)
 
-    def simulate(self, plant: Any, layer: dpc.DPCLayer, seed: int, attack: Any) -> dpc.ClosedLoopLog:
+    def simulate(
+        self, plant: Any, layer: dpc.DPCLayer, seed: int, attack: Any, scenario: Scenario = FIGURE
+    ) -> dpc.ClosedLoopLog:
         generator = torch.Generator().manual_seed(ATTACK_SEED + seed)
         state = self.state(generator)
         plant.generator = generator
-        return self.run_from(plant, layer, state, seed, attack)
+        if scenario.start == "away":
+            state = torch.zeros_like(state)
+        if scenario.start == "random":
+            state = state + self.random_start * torch.randn(4, dtype=torch.float64, generator=start_generator(seed))
+        return self.run_from(plant, layer, state, seed, attack, scenario=scenario)
 
     def run_from(
-        self, plant: Any, layer: dpc.DPCLayer, state: Tensor, seed: int, attack: Any, on_failure: Any = "hold"
+        self,
+        plant: Any,
+        layer: dpc.DPCLayer,
+        state: Tensor,
+        seed: int,
+        attack: Any,
+        on_failure: Any = "hold",
+        scenario: Scenario = FIGURE,
     ) -> dpc.ClosedLoopLog:
         """Run from an initial state; the seed draws the attack's noise."""
-        y_ref, u_ref = self.references(self.steps + self.horizon)
+        y_ref, u_ref = self.references_in(scenario, self.steps + self.horizon)
         assert u_ref is not None
         return dpc.simulate(
-            plant,
+            Pushed(plant, self.push, self.t_ini, seed) if scenario.pushed else plant,
             dpc.DPCController(layer, self.replan_every, on_failure=on_failure),
             y_ref,
             steps=self.steps,
@@ -98,13 +117,13 @@ class Masses(Case):
             u_warmup=u_ref[0],
         )
 
-    def wanted(self) -> Tensor:
+    def wanted_inputs(self) -> Tensor:
         """Return the inputs the attacker wants, sin(t) [N] on both masses, as far as the last plan reaches."""
         t = self.dt * torch.arange(self.steps + self.horizon, dtype=torch.float64)
         return torch.sin(t)[:, None].expand(-1, 2)
 
     def target(self) -> attacks.TargetInput:
-        return attacks.TargetInput(trajectory=self.wanted())
+        return attacks.TargetInput(trajectory=self.wanted_inputs())
 
     def columns(self, plant: Any, log: dpc.ClosedLoopLog) -> dict[str, Any]:
         return {
@@ -118,7 +137,7 @@ class Masses(Case):
     @property
     def context(self) -> Tensor:
         """What a trained network sees of the attacker's aim, `(steps + horizon, n_u)`."""
-        return self.wanted()
+        return self.wanted_inputs()
 
     def starts(self, n: int, seed: int) -> Tensor:
         """Return initial states, `(n, 4)`: the first at rest, the others disturbed."""
@@ -168,7 +187,7 @@ class Masses(Case):
 
     def wanted_at(self, step: Tensor) -> Tensor:
         """Return the inputs that the attacker wants of the plans made at these steps, `(n, horizon, n_u)`."""
-        wanted = self.wanted()
+        wanted = self.wanted_inputs()
         return wanted[(step[:, None] + torch.arange(self.horizon)).clamp_max(len(wanted) - 1)]
 
     def judge(self, setting: str, seed: int, make_attacks: Any) -> list[dict[str, Any]]:

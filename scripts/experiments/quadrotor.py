@@ -19,6 +19,7 @@ from torch import Tensor
 import torch_dpc as dpc
 from scripts.experiments.case import ATTACK_SEED, Case
 from scripts.experiments.closed_loops import HELD_OUT, TRAINING, Windows, closed_loops, drawn
+from scripts.experiments.scenario import FIGURE, Pushed, Scenario, start_generator
 from scripts.shared.command import run_all
 from torch_dpc import attacks
 
@@ -89,6 +90,8 @@ class Quadrotor(Case):
     pull: float = 0.3  # [1/s]: towards the centre, so that a recording stays within the bounds on the position
     noise: float = 0.0  # of the recorded outputs, relative to the standard deviation of each
     physics_hz: int = 250  # [1/s]: 0.04 s are 10 steps; at 240 Hz they are no whole number
+    random_start: float = 0.3  # [m]: half the side of the cube around the figure's start, of runs that start anywhere
+    push: float = 0.2  # [m/s]: standard deviation of a push on the commands
 
     # --- the closed loop ----------------------------------------------------------------------------------------------
 
@@ -147,22 +150,35 @@ class Quadrotor(Case):
         speed = 2 * math.pi / self.period * self.radius
         return self.circle(steps), speed * torch.stack([-angle.sin(), angle.cos(), 0 * angle], dim=1)
 
-    def simulate(self, plant: Any, layer: dpc.DPCLayer, seed: int, attack: Any) -> dpc.ClosedLoopLog:
+    def middle(self) -> Tensor:
+        return torch.cat([self.centre, torch.zeros(3, dtype=torch.float64)])
+
+    def simulate(
+        self, plant: Any, layer: dpc.DPCLayer, seed: int, attack: Any, scenario: Scenario = FIGURE
+    ) -> dpc.ClosedLoopLog:
         """Fly from rest on the circle, `t_ini` steps before the reference begins to move."""
-        y_ref, u_ref = self.references(self.steps + self.horizon)
+        y_ref, u_ref = self.references_in(scenario, self.steps + self.horizon)
+        start = y_ref[0, :3]
+        if scenario.start == "away":
+            start = self.centre
+        if scenario.start == "random":
+            start = start + self.random_start * (2 * torch.rand(3, generator=start_generator(seed)).double() - 1)
         return dpc.simulate(
-            plant,
+            Pushed(plant, self.push, self.t_ini, seed) if scenario.pushed else plant,
             dpc.DPCController(layer, self.replan_every, on_failure="hold"),
             y_ref,
             steps=self.steps,
             u_ref=u_ref,
             attack=attack,
             generator=torch.Generator().manual_seed(ATTACK_SEED + seed),
-            reset={"position": y_ref[0, :3]},
+            reset={"position": start},
         )
 
     def target(self) -> attacks.TargetInput:
         return attacks.TargetInput(torch.tensor(self.u_target, dtype=torch.float64))
+
+    def wanted_inputs(self) -> Tensor:
+        return self.target().target.expand(self.steps + self.horizon, -1)
 
     def columns(self, plant: Any, log: dpc.ClosedLoopLog) -> dict[str, Any]:
         """Return positions [m], angles [rad] and commands [m/s]; a crashed vehicle needs no plan."""

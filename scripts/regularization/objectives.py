@@ -1,5 +1,8 @@
 """What tuning minimises: one objective for each training recording, on windows of closed-loop runs.
 
+The runs start on the reference, away from it and at random, are pushed, and change their reference: weights that no
+longer control cost much in most of them.
+
 Four kinds of recordings have seeds far apart: those tuned on, those behind the predictor that judges plans, those by
 which one point is chosen, and the held-out ones by which it is judged.
 """
@@ -16,12 +19,14 @@ from torch import Tensor
 import torch_dpc as dpc
 from scripts.experiments.case import Case, Weights
 from scripts.experiments.masses import Masses, MovingTarget
+from scripts.experiments.scenario import FIGURE, RANDOM_START, SCENARIOS
 from scripts.shared.statistics import NOMINAL, POISON
 from torch_dpc import tuning
 
 TRAINING, PREDICTOR, VALIDATION = (100, 101, 102), (200, 201, 202, 203), (110, 111, 112, 113, 114, 115)
-HELD_OUT_FROM = 300
-WINDOW_EVERY = 50  # steps between the windows that are cut from a run
+HELD_OUT_FROM = 9000
+WINDOW_EVERY = 60  # steps between the windows that are cut from a run
+ATTACKED = (FIGURE, RANDOM_START)  # scenarios whose runs under attack give windows too
 PLANS = {"masses": 10, "quadrotor": 8}  # of a run in the objective, `replan_every` steps each
 #: The paper's weight of the attitude is 0, whose logarithm cannot move: tuning starts from this one.
 ATTITUDE = 1.0  # [1/rad^2], beside 10 / m^2 on the position
@@ -66,24 +71,25 @@ def _prepared(case: Case, plant: Any) -> Any:
 
 
 def _windows(case: Case, plant: Any, layer: dpc.DPCLayer, seed: int) -> tuple[tuning.Windows, Tensor]:
-    """Return windows from a run without and one under attack, and the steps at which their plans begin."""
-    t_ini = case.t_ini
-    kept = slice(t_ini, case.steps, WINDOW_EVERY)
-    starts = torch.arange(case.steps)[kept]
-    pieces = []
-    for kind in (NOMINAL, POISON):
-        log = case.simulate(plant, layer, seed, case.attack(kind, case.rho, layer))
-        pieces += [(log.u[k - t_ini : k], log.y[k - t_ini : k]) for k in starts.tolist()]
-    u_ini, y_ini = (torch.stack(part) for part in zip(*pieces, strict=True))
-    starts = starts.repeat(2)
-    length = PLANS[case.plant] * case.replan_every + case.horizon
-    rows = starts[:, None] + torch.arange(length)
-    y_ref, u_ref = case.references(int(rows.max()) + 1)
-    return tuning.Windows(u_ini, y_ini, y_ref[rows], None if u_ref is None else u_ref[rows]), starts
+    """Return windows from runs of every scenario, two of them under attack too, and the steps at which they begin."""
+    first = slice(case.t_ini, case.steps, WINDOW_EVERY)
+    steps = torch.arange(case.steps)[first]
+    rows = steps[:, None] + torch.arange(PLANS[case.plant] * case.replan_every + case.horizon)
+    past = steps[:, None] + torch.arange(-case.t_ini, 0)
+    parts: list[tuple[Tensor, Tensor, Tensor, Tensor | None]] = []
+    for scenario in SCENARIOS:
+        y_ref, u_ref = case.references_in(scenario, int(rows.max()) + 1)
+        for kind in (NOMINAL, POISON) if scenario in ATTACKED else (NOMINAL,):
+            log = case.simulate(plant, layer, seed, case.attack(kind, case.rho, layer), scenario)
+            parts.append((log.u[past], log.y[past], y_ref[rows], None if u_ref is None else u_ref[rows]))
+    u_ini, y_ini, wanted, held = zip(*parts, strict=True)
+    inputs = None if held[0] is None else torch.cat(held)
+    windows = tuning.Windows(torch.cat(u_ini), torch.cat(y_ini), torch.cat(wanted), inputs)
+    return windows, steps.repeat(len(parts))
 
 
 def _windows_target(case: Case, starts: Tensor) -> Any:
     """Return what the paper's attacker wants of a batch of windows that start at different steps of a run."""
     if not isinstance(case, Masses):
         return case.target()
-    return MovingTarget(replace(case, steps=2 * case.steps).wanted(), starts)
+    return MovingTarget(replace(case, steps=2 * case.steps).wanted_inputs(), starts)

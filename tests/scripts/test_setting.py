@@ -54,7 +54,7 @@ PAPER = {
     },
 }
 OUR_CHOICE = {
-    Masses: {"u_ref": (1.0, 1.0), "noise": 0.0, "start_spread": 0.1},
+    Masses: {"u_ref": (1.0, 1.0), "noise": 0.0, "start_spread": 0.1, "random_start": 0.5, "push": 0.3},
     Quadrotor: {
         "period": 10.0,
         "height": 1.0,
@@ -64,6 +64,8 @@ OUR_CHOICE = {
         "pull": 0.3,
         "noise": 0.0,
         "physics_hz": 250,
+        "random_start": 0.3,
+        "push": 0.2,
     },
 }
 
