@@ -9,6 +9,7 @@ LAPACK's default cut-off throws away what matters. Scaling the rows of J' to uni
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import torch
@@ -22,6 +23,13 @@ from ._adapter import Baseline, PeerResult
 from ._layer import Judge
 from ._problem import QP, Call
 
+#: (J', right) -> the least-squares solution of least norm.
+LeastSquares = Callable[[Tensor, Tensor], Tensor]
+
+
+def _gelsd(matrix: Tensor, right: Tensor) -> Tensor:
+    return torch.linalg.lstsq(matrix, right, driver="gelsd").solution
+
 
 class FullKKT(Baseline):
     """The layer's forward solve, differentiated by the paper's full system.
@@ -29,13 +37,15 @@ class FullKKT(Baseline):
     Args:
         layer: the layer whose problem is solved.
         scaled: scale the rows of J' to unit norm before the least squares; False for the system as printed.
+        least_squares: solves J' s = right, `(n, n)` and `(n, 1)`; by default LAPACK's gelsd with its default cut-off.
 
     A weakly active row counts as inactive, as in the layer.
     """
 
-    def __init__(self, layer: DPCLayer, *, scaled: bool = True):
+    def __init__(self, layer: DPCLayer, *, scaled: bool = True, least_squares: LeastSquares | None = None):
         super().__init__(layer, "paper")
         self.scaled, self._exact = scaled, Judge(layer, WEAKLY_ACTIVE)
+        self.least_squares = _gelsd if least_squares is None else least_squares
         self.name = "full KKT" if scaled else "full KKT as printed"
 
     @property
@@ -50,7 +60,7 @@ class FullKKT(Baseline):
             v = torch.cat([sol.u.flatten(-2), sol.y.flatten(-2)], dim=-1)
             active, _ = self._exact.active(v, sol.lam)
             z = torch.cat([v, sol.g], dim=-1)
-        z = _FullSystem.apply(call.theta, z, active, self.qp, self.scaled)
+        z = _FullSystem.apply(call.theta, z, active, self.qp, self.scaled, self.least_squares)
         return PeerResult(z, sol.lam[:, self.qp.rows], sol.info.iterations)
 
 
@@ -71,9 +81,11 @@ class _FullSystem(torch.autograd.Function):
     """theta -> z, its derivative from J and K."""
 
     @staticmethod
-    def forward(ctx: Any, theta: Tensor, z: Tensor, active: Tensor, qp: QP, scaled: bool) -> Tensor:
+    def forward(
+        ctx: Any, theta: Tensor, z: Tensor, active: Tensor, qp: QP, scaled: bool, least_squares: LeastSquares
+    ) -> Tensor:
         ctx.save_for_backward(active)
-        ctx.qp, ctx.scaled = qp, scaled
+        ctx.qp, ctx.scaled, ctx.least_squares = qp, scaled, least_squares
         return z.clone()
 
     @staticmethod
@@ -90,8 +102,8 @@ class _FullSystem(torch.autograd.Function):
                 norms = torch.linalg.vector_norm(transposed, dim=1, keepdim=True)
                 scale = torch.where(norms > 0, 1 / norms, 1.0)
                 transposed, right = scale * transposed, scale * right
-            s = torch.linalg.lstsq(transposed, right, driver="gelsd").solution[:, 0]
+            s = ctx.least_squares(transposed, right)[:, 0]
             free = s[:n].clone()
             free[: qp.n_v][rows] = 0.0  # D1
             theta_bar.append(s[n:] @ qp.b_theta - free @ qp.q_theta)  # -K's
-        return torch.stack(theta_bar), None, None, None, None
+        return torch.stack(theta_bar), None, None, None, None, None
