@@ -16,7 +16,7 @@ from torch.utils._pytree import register_pytree_node
 _functorch = getattr(torch._C, "_functorch", None)
 _is_wrapped = getattr(_functorch, "is_functorch_wrapped_tensor", lambda tensor: True)
 _is_legacy_batched = getattr(_functorch, "is_legacy_batchedtensor", lambda tensor: False)
-_are_transforms_active = getattr(torch._C, "_are_functorch_transforms_active", lambda: True)
+are_transforms_active = getattr(torch._C, "_are_functorch_transforms_active", lambda: True)
 
 
 def is_plain(tensor: Tensor) -> bool:
@@ -55,7 +55,7 @@ def apply_function(function: type[torch.autograd.Function], *args: Any) -> Any:
     `Function.apply` binds the arguments by name and looks for wrappers that transforms left behind, which takes longer
     than the rest of a small Function. Where no transform is at work and nothing is wrapped, what it then calls will do.
     """
-    if _are_transforms_active() or not all(is_plain(arg) for arg in args if isinstance(arg, Tensor)):
+    if are_transforms_active() or not all(is_plain(arg) for arg in args if isinstance(arg, Tensor)):
         return function.apply(*args)
     return super(torch.autograd.Function, function).apply(*args)  # type: ignore[misc]
 
@@ -78,7 +78,7 @@ def untransformed() -> contextlib.AbstractContextManager[Any]:
 
 def constant(tensor: Tensor) -> Tensor:
     """Return a tensor's numbers, without its graph, its tangent, and the wrappers of `torch.func.grad` and `jvp`."""
-    if _functorch is None or not _are_transforms_active():
+    if _functorch is None or not are_transforms_active():
         return tensor.detach()
     with untransformed():
         while _functorch.is_gradtrackingtensor(tensor):
@@ -92,7 +92,7 @@ def carries_derivative(values: tuple[Any, ...]) -> bool:
     What a transform has wrapped counts: a derivative that an outer one asks for is not seen from within an inner one.
     """
     tensors = [value for value in values if isinstance(value, Tensor)]
-    if _are_transforms_active() and not all(map(is_plain, tensors)):
+    if are_transforms_active() and not all(map(is_plain, tensors)):
         return True
     if torch.is_grad_enabled() and any(tensor.requires_grad for tensor in tensors):
         return True

@@ -401,6 +401,20 @@ def test_the_papers_full_system_gives_the_same_derivative(case):
     assert (sol.info.n_active > 0).any() and relative(bars[1], bars[0]) < FULL
 
 
+@pytest.mark.parametrize("case", ["radius", "soft bound"])
+def test_forward_derivatives_over_the_parameters_of_a_set(case):
+    """By torch.autograd.forward_ad, which does not nest, as gradcheck takes them."""
+    u_ini, y_ini = inputs(2)
+    start = torch.tensor([0.4, 5.0], dtype=torch.float64, requires_grad=True)
+
+    def plan(x):
+        sets = {"u_set": dpc.Ball(x[0])} if case == "radius" else {"y_set": dpc.SoftBox(-x[0], x[0], weight=x[1])}
+        return dpc.DPCLayer(small_data(), **SMALL, **sets)(u_ini, y_ini, y_ref=Y_REF).u
+
+    assert torch.autograd.gradcheck(plan, start, check_forward_ad=True)
+    assert torch.autograd.gradgradcheck(plan, start, check_fwd_over_rev=True)
+
+
 def test_the_full_system_reaches_a_radius_and_derives_once():
     radius = torch.nn.Parameter(torch.tensor(0.4, dtype=torch.float64))
     u_ini, y_ini = inputs()

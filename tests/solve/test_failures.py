@@ -193,7 +193,8 @@ NAN[1, 2], INF[0, 0] = torch.nan, torch.inf
     ids=lambda v: v[:40] if isinstance(v, str) else "",
 )
 def test_bad_calls_are_named(change, says):
-    for failures in ("raise", "nan"):
+    in_one_of_many = says == "`y_ini` must be finite" and len(change["y_ini"]) == 31  # "nan" marks that sample
+    for failures in ("raise",) if in_one_of_many else ("raise", "nan"):
         with pytest.raises(ValueError, match=says):
             small_layer(on_failure=failures)(**{"u_ini": u_ini, "y_ini": y_ini, **change})
 
@@ -306,3 +307,25 @@ def test_a_setting_that_does_not_fit_may_be_on_the_way_to_one_that_does():
     layer.u_set = dpc.Ball(0.3)
     layer.backward, layer.solver = "reduced", "auto"
     assert float(layer(u_ini, y_ini, y_ref=Y_REF).u.norm(dim=-1).amax()) == pytest.approx(0.3, abs=1e-9)
+
+
+@pytest.mark.parametrize("sets", [{}, {"u_set": dpc.Ball(0.3)}], ids=["boxes", "ball"])
+@pytest.mark.parametrize("spoilt", [torch.nan, torch.inf])
+def test_a_value_that_is_not_finite_marks_its_sample(sets, spoilt):
+    layer = small_layer(**sets, on_failure="nan")
+    u, y = windows(4, 3, seed=1, scale=0.5)
+    with_nan = y.clone()
+    with_nan[2, 1, 3] = spoilt
+    plans, bars = [], []
+    for measured in (y, with_nan):
+        x = measured.clone().requires_grad_()
+        plan = layer(u, x, y_ref=Y_REF)
+        plan.u[[0, 1, 3]].square().sum().backward()
+        plans.append(plan)
+        bars.append(x.grad)
+    whole, marked = plans
+    assert marked.info.status.tolist() == [0, 0, 2, 0] and marked.u[2].isnan().all() and marked.g[2].isnan().all()
+    assert torch.equal(marked.u[[0, 1, 3]], whole.u[[0, 1, 3]]) and not marked.lam[2].any()
+    assert relative(bars[1][[0, 1, 3]], bars[0][[0, 1, 3]]) < 1e-12 and not bars[1][2].any()
+    with pytest.raises(ValueError, match="`y_ini` must be finite, got 1 NaN or infinite"):
+        layer(u, with_nan, on_failure="raise")

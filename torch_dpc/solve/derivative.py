@@ -26,6 +26,7 @@ from torch import Tensor
 
 from ..autodiff import apply_function, carries_derivative, is_plain, refuse_forward_twice
 from ..batching import lead_all, outer, times
+from ..checks import is_finite
 from ..errors import Status
 from ..problem.reduction import Reduction
 from ..sets.bounds import Bounds
@@ -56,11 +57,25 @@ def plan(solver: Solver, theta: Tensor, reduction: Reduction, sets: Sets, on_fai
     matrices: tuple[Tensor | None, ...] = (reduction.A_theta, reduction.rows.C, reduction.G)
     if not carries_derivative(matrices):
         if not carries_derivative((theta, *sets.tensors)) and all(map(is_plain, (theta, *sets.tensors))):
-            return solver.solve(theta, sets, on_failure)  # a third of the time of a small call is the Function's
+            return _solve(solver, theta, sets, on_failure)  # a third of the time of a small call is the Function's
         matrices = (None, None, None)  # constants: those of the solver will do, and need not be saved
     if not sets.is_piecewise_affine:
         refuse_forward_twice()
     return Planned(*apply_function(Plan, theta, *matrices, solver, sets, on_failure, *sets.tensors))
+
+
+def _solve(solver: Solver, theta: Tensor, sets: Sets, on_failure: str) -> Planned:
+    """Solve without a graph.
+
+    With `on_failure="nan"` a value that is not finite marks its sample of a batch as failed; where it spoils every
+    sample, as in a reference that all share, it is an error all the same.
+    """
+    if on_failure == "raise" or theta.ndim == 1 or is_finite(theta):
+        return solver.solve(theta, sets, on_failure)
+    spoilt = ~theta.isfinite().all(-1)
+    if bool(spoilt.all()):
+        return solver.solve(theta, sets, on_failure)
+    return solver.solve(torch.where(spoilt[..., None], 0.0, theta), sets, on_failure).without(spoilt)
 
 
 class Plan(torch.autograd.Function):
@@ -81,10 +96,10 @@ class Plan(torch.autograd.Function):
         *of_sets: Tensor,
     ) -> tuple[Tensor, ...]:
         if sets.is_box:
-            return tuple(solver.solve(theta, sets.with_tensors(of_sets), on_failure)[:5])
+            return tuple(_solve(solver, theta, sets.with_tensors(of_sets), on_failure)[:5])
         with torch.no_grad():
             constants = [x.detach() if x.requires_grad else x for x in of_sets]
-            planned = solver.solve(theta.detach(), sets.with_tensors(constants), on_failure)
+            planned = _solve(solver, theta.detach(), sets.with_tensors(constants), on_failure)
         return tuple(x for x in planned if x is not None)
 
     @staticmethod

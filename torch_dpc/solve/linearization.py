@@ -8,7 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..autodiff import is_grads_batched
+from ..autodiff import are_transforms_active, is_grads_batched
 from ..batching import times
 from ..errors import Status
 from ..sets.feasible import Blocks
@@ -98,8 +98,7 @@ class Linearization:
         rhs = torch.where(self.solved, free, 0.0)[..., order]
         if not some:
             return adjoint(None, rhs, G, engines.system, self.D)[..., engines.inverse]
-        tangents = tuple(torch.zeros_like(s) if t is None else t for s, t in zip(self.of_sets, of_sets_t, strict=True))
-        moved = torch.func.jvp(self._project(gamma), tuple(self.of_sets), tangents)[1]
+        moved = _push(self._project(gamma), self.of_sets, of_sets_t)
         moved = torch.where(self.solved, moved, 0.0)
         p = moved / gamma
         lam_t = adjoint(None, rhs - moved + times(G, p), G, engines.system, self.D) - p
@@ -137,6 +136,31 @@ class Linearization:
     def _project(self, gamma: Tensor | float) -> Callable[..., Tensor]:
         """Return the projection of x as a function of the tensors that the sets are made of."""
         return lambda *of_sets: self.sets.with_tensors(of_sets).prox(self.x, gamma)
+
+
+def _push(function: Callable[..., Tensor], at: list[Tensor], tangents: tuple[Tensor | None, ...]) -> Tensor:
+    """Return the tangent of a function's value.
+
+    Forward derivatives of torch.autograd do not nest, as those of torch.func do: within one the product is taken as the
+    derivative of w -> (pullback of w), which is linear.
+    """
+    if are_transforms_active():
+        whole = tuple(torch.zeros_like(s) if t is None else t for s, t in zip(at, tangents, strict=True))
+        pushed: Tensor = torch.func.jvp(function, tuple(at), whole)[1]
+        return pushed
+    creates_graph = torch.is_grad_enabled()
+    with torch.enable_grad():
+        arguments = [x.view_as(x) if x.requires_grad else x.detach().requires_grad_() for x in at]
+        value = function(*arguments)
+        w = torch.zeros_like(value).requires_grad_()
+        bars = torch.autograd.grad(value, arguments, w, create_graph=True, allow_unused=True)
+        pairs = [(bar, t) for bar, t in zip(bars, tangents, strict=True) if bar is not None and t is not None]
+        if not pairs:
+            return torch.zeros_like(value)
+        (pushed,) = torch.autograd.grad(
+            [bar for bar, _ in pairs], w, [t for _, t in pairs], create_graph=creates_graph, materialize_grads=True
+        )
+    return pushed
 
 
 def _pull(function: Callable[..., Tensor], at: list[Tensor], cotangent: Tensor) -> tuple[Tensor | None, ...]:

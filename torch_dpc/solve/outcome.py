@@ -100,6 +100,21 @@ class Planned(NamedTuple):
     du: Tensor | None = None
     weak: Tensor | None = None
 
+    def without(self, samples: Tensor) -> Planned:
+        """Return the solution with some samples, `(*batch,)`, marked as failed."""
+        lost = samples.expand(self.info.shape[:-1])[..., None]
+        info = torch.zeros_like(self.info)
+        info[..., 0], info[..., 2] = float(Status.FAILED), torch.nan
+        return Planned(
+            torch.where(lost[..., None], torch.nan, self.u),
+            torch.where(lost[..., None], torch.nan, self.y),
+            torch.where(lost, 0.0, self.lam),
+            self.active & ~lost,
+            torch.where(lost, info, self.info),
+            None if self.du is None else torch.where(lost, torch.nan, self.du),
+            None if self.weak is None else self.weak | lost,
+        )
+
 
 def joined(sizes: Sizes, u: Tensor | None, y: Tensor | None, du: Tensor | None, like: Tensor) -> Tensor:
     """Return v `(*batch, N)` of its parts u, y `(*batch, horizon, n)` and du `(*batch, n_du)`; zero for None."""
