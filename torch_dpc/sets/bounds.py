@@ -34,8 +34,9 @@ class Bounds:
         return self.lower.ndim == self.upper.ndim == 1
 
     def with_tensors(self, tensors: Iterable[Tensor]) -> Bounds:
-        """Return the bounds with these in place of `tensors`."""
-        return Bounds(*tensors)
+        """Return the bounds with these in place of `tensors`; itself if they are the same."""
+        lower, upper = tensors
+        return self if lower is self.lower and upper is self.upper else Bounds(lower, upper)
 
     def batches(self, device: torch.device) -> list[tuple[str, torch.Size]]:
         """Return the batch dimensions of both, by name."""

@@ -19,7 +19,6 @@ from ..sets.units import in_units
 from ..sets.values import values_of
 from . import kernels
 from .engines import Sets
-from .outcome import Solved
 
 #: The kernel multiplies V by theta up to this many samples; a matrix product is faster for more.
 FEW = 4
@@ -58,8 +57,8 @@ class CompiledPlanner:
     def _per_unit(self) -> np.ndarray:
         return 1 / self._map.unit
 
-    def solve(self, theta: Tensor, sets: Sets) -> tuple[Solved, Tensor] | None:
-        """Return the plans, in the caller's units, and which of them convince, `(*batch,)`.
+    def solve(self, theta: Tensor, sets: Sets) -> kernels.PlannedArrays | None:
+        """Return the plans, in the caller's units, with the batch dimensions of theta; `convinces` stays `(B,)`.
 
         Args:
             theta: `(*batch, n_theta)`.
@@ -72,62 +71,65 @@ class CompiledPlanner:
         arrays = self._arrays(sets, batch, theta.device)
         if arrays is None:
             return None
-        flat = theta.reshape(-1, theta.shape[-1])
-        v0 = None if len(flat) <= FEW else (flat @ self.reduction.V.mT).numpy()
-        found = kernels.plan(self._map, arrays, kernels.as_array(flat), v0, torch.get_num_threads())
-        v, lam, active, weak, info = (torch.from_numpy(x).reshape(*batch, x.shape[-1]) for x in found[:5])
-        solved = Solved(v, lam, active, info, None if sets.is_box else weak)
-        return solved, torch.from_numpy(found.convinces).reshape(batch)
+        flat = kernels.as_array(theta).reshape(-1, theta.shape[-1])
+        v0 = None if len(flat) <= FEW else (theta.reshape(flat.shape) @ self.reduction.V.mT).numpy()
+        found = kernels.plan(self._map, arrays, flat, v0, torch.get_num_threads())
+        if len(batch) == 1:
+            return found
+        v, lam, active, weak, info = (x.reshape(*batch, x.shape[-1]) for x in found[:5])
+        return kernels.PlannedArrays(v, lam, active, weak, info, found.convinces)
 
     def adjoint(
-        self, sets: Sets, at: tuple[Tensor, Tensor, Tensor, Tensor], v_bar: Tensor, lam_bar: Tensor | None
-    ) -> tuple[Tensor, Tensor] | None:
-        """Return v0_bar = v_bar + S (lam_bar - G v_bar) `(*batch, N)`, and theta_bar = V' v0_bar.
+        self, sets: Sets, at: tuple[Tensor, Tensor, Tensor, Tensor], v_bar: np.ndarray, lam_bar: Tensor | None
+    ) -> Tensor | None:
+        """Return theta_bar = V'(v_bar + S (lam_bar - G v_bar)), `(*batch, n_theta)`.
 
         Args:
             sets: those of the plan, in the caller's units.
             at: v, lam, active and weak rows of the plan, `(*batch, N)`; for boxes v and weak rows do not count.
-            v_bar, lam_bar: cotangents, likewise; lam_bar may be missing.
+            v_bar: cotangent of v, likewise.
+            lam_bar: cotangent of lam, or None for zero.
 
         Returns:
             None if the kernel does not know the sets, or the held directions of a sample are dependent.
         """
         batch, n = v_bar.shape[:-1], v_bar.shape[-1]
-        arrays = self._arrays(sets, batch, v_bar.device)
+        arrays = self._arrays(sets, torch.Size(batch), self.unit.device)
         if arrays is None:
             return None
-        v, lam, active, weak = (kernels.as_array(x.reshape(-1, n)) for x in at)
-        bars = (
-            kernels.as_array(v_bar.reshape(-1, n)),
-            None if lam_bar is None else kernels.as_array(lam_bar.reshape(-1, n)),
-        )
+        v, lam, active, weak = (kernels.as_array(x).reshape(-1, n) for x in at)
+        bars = v_bar.reshape(-1, n), None if lam_bar is None else kernels.as_array(lam_bar).reshape(-1, n)
         few, threads = len(lam) <= FEW, torch.get_num_threads()
         found = kernels.plan_adjoint(self._map, arrays, (v, lam, active, weak), *bars, of_theta=few, threads=threads)
         if found is None:
             return None
-        v0_bar = torch.from_numpy(found[0])
-        theta_bar = (v0_bar * self.unit) @ self.reduction.V if found[1] is None else torch.from_numpy(found[1])
-        return v0_bar.reshape(v_bar.shape), theta_bar.reshape(*batch, theta_bar.shape[-1])
+        v0_bar, theta_bar = found
+        if theta_bar is None:
+            theta_bar = ((torch.from_numpy(v0_bar) * self.unit) @ self.reduction.V).numpy()
+        return torch.from_numpy(theta_bar.reshape(*batch, theta_bar.shape[-1]))
 
     def _arrays(self, sets: Sets, batch: torch.Size, device: torch.device) -> kernels.SetArrays | None:
         """Return the sets in units as the kernel reads them; None if it does not know them, or another batch."""
         if not kernels.serve(self.unit):
             return None
+        kept = self._kept[0] if self._kept else None
+        if kept is not None and kept[0] is sets:
+            return kept[1]
         if isinstance(sets, Bounds):
             if not all(bound.shape[:-1] in (torch.Size(), batch) for bound in sets.tensors):
                 return None
             sides = (x.reshape(-1, x.shape[-1]) if x.ndim > 2 else x for x in sets.tensors)
             lower, upper = (side.detach().numpy() * self._per_unit for side in sides)
-            return lower, upper, None, *_NO_BLOCKS
-        kept = self._kept[0] if self._kept else None
-        if kept is not None and kept[0] is sets:
-            return kept[1]
+            return self._keep(sets, (lower, upper, None, *_NO_BLOCKS), sets.are_shared)
         if sets.batch_shape not in (torch.Size(), batch):
             return None
         values = values_of(in_units(sets, self.unit), batch, device)
         if values is None:
             return None
-        arrays = kernels.set_arrays(values)
-        if not sets.batch_shape:  # the layer compares the parameters at every call, and makes new sets if they changed
+        return self._keep(sets, kernels.set_arrays(values), not sets.batch_shape)
+
+    def _keep(self, sets: Sets, arrays: kernels.SetArrays, are_shared: bool) -> kernels.SetArrays:
+        """Keep the arrays for the next call: a layer makes new sets if a parameter has changed."""
+        if are_shared:
             self._kept[:] = [(sets, arrays)]
         return arrays

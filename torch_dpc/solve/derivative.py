@@ -21,6 +21,7 @@ from __future__ import annotations
 import inspect
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -29,6 +30,7 @@ from ..batching import lead_all, outer, times
 from ..checks import is_finite
 from ..errors import Status
 from ..problem.reduction import Reduction
+from ..problem.terms import Sizes
 from ..sets.bounds import Bounds
 from ..sets.parameters import check_order
 from .engines import Sets
@@ -220,16 +222,28 @@ def _compiled_adjoint(
     if planner is None:
         return None
     lam, active, info, *of_curved = saved
-    v_bar, v, weak = joined(sizes, u_bar, y_bar, du_bar, lam), lam, active  # for boxes v and weak do not count
+    v, weak = lam, active  # for boxes they do not count
     if not ctx.sets.is_box:
         u, y, du, weak, *_ = of_curved
         v = joined(sizes, u, y, du, lam)
+    v_bar = _as_rows(sizes, u_bar, y_bar, du_bar, lam.shape)
     if ctx.may_fail:  # samples without a solution add nothing, whatever came back for their NaN
         solved = info[..., :1] == Status.SOLVED
-        v_bar, v = torch.where(solved, v_bar, 0.0), torch.where(solved, v, 0.0)
+        v_bar, v = np.where(solved.numpy(), v_bar, 0.0), torch.where(solved, v, 0.0)
         lam_bar = None if lam_bar is None else torch.where(solved, lam_bar, 0.0)
-    found = planner.adjoint(ctx.sets, (v, lam, active, weak), v_bar, lam_bar)
-    return None if found is None else found[1]
+    return planner.adjoint(ctx.sets, (v, lam, active, weak), v_bar, lam_bar)
+
+
+def _as_rows(
+    sizes: Sizes, u_bar: Tensor | None, y_bar: Tensor | None, du_bar: Tensor | None, shape: torch.Size
+) -> np.ndarray:
+    """Return the cotangents of u, y and du as one of v, an array `(*batch, N)`; zero for None."""
+    v_bar, start = np.zeros(shape), 0
+    for bar, size in ((u_bar, sizes.u), (y_bar, sizes.y), (du_bar, sizes.du)):
+        if bar is not None and size:
+            v_bar[..., start : start + size] = bar.numpy().reshape(*shape[:-1], size)
+        start += size
+    return v_bar
 
 
 # `apply` binds its arguments by the signature of `forward` at every call; finding it anew each time costs 15 us.

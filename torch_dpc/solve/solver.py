@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,6 +25,7 @@ from .active_set import solve_active
 from .certificate import is_infeasible
 from .compiled import CompiledPlanner
 from .engines import Engines, Sets
+from .kernels import PlannedArrays
 from .optimality import BATCHED, Optimality
 from .outcome import ACCEPTANCE, Planned, Solved, check_finite, joined, report_failures
 from .projected_system import newton_step
@@ -99,17 +100,23 @@ class Solver:
             ValueError: values that are not finite.
             InfeasibleError, SolveError: with `on_failure="raise"`, if a sample has no accepted solution.
         """
+        quick = self.compiled.solve(theta, sets) if self.compiled is not None and self.engine != "daqp" else None
+        if quick is not None and quick.convinces.all():
+            return self._planned(quick.v, quick.lam, quick.active, quick.info, quick.weak, sets)
         if self.single is not None and isinstance(sets, Bounds):
             planned = self.single.solve(theta, sets, self.engine)
             if planned is not None:
                 return planned
-        compiled = self.compiled.solve(theta, sets) if self.compiled is not None and self.engine != "daqp" else None
-        solved = self._solve_generally(theta, sets) if compiled is None else self._completed(*compiled, theta, sets)
+        solved = self._solve_generally(theta, sets) if quick is None else self._completed(quick, theta, sets)
         report_failures(solved.info, on_failure)
-        planned = Planned(*self.sizes.split(solved.v), solved.lam, solved.active, solved.info)
-        if sets.is_box:
-            return planned
-        return planned._replace(du=solved.v[..., self.sizes.u + self.sizes.y :], weak=solved.weak)
+        return self._planned(*solved, sets)
+
+    def _planned(self, v: Any, lam: Any, active: Any, info: Any, weak: Any, sets: Sets) -> Planned:
+        """Return tensors or arrays as the plan."""
+        found = [*self.sizes.split(v), lam, active, info]
+        if not sets.is_box:
+            found += [v[..., self.sizes.u + self.sizes.y :], weak]
+        return Planned(*(x if isinstance(x, Tensor) else torch.from_numpy(x) for x in found))
 
     def _solve_generally(self, theta: Tensor, sets: Sets) -> Solved:
         """Solve by engines, judge, second look and certificate, whatever the problem."""
@@ -117,12 +124,12 @@ class Solver:
         solved = self.in_units._solve_flat(theta, in_units(sets, self.unit))
         return solved._replace(v=solved.v * self.unit, lam=solved.lam / self.unit)
 
-    def _completed(self, solved: Solved, convinces: Tensor, theta: Tensor, sets: Sets) -> Solved:
-        """Solve the samples again that do not convince."""
-        if bool(convinces.all()):
-            return solved
-        if convinces.ndim != 1 or not (isinstance(sets, Bounds) or not sets.batch_shape):
+    def _completed(self, quick: PlannedArrays, theta: Tensor, sets: Sets) -> Solved:
+        """Solve the samples generally that do not convince."""
+        if theta.ndim != 2 or not (isinstance(sets, Bounds) or not sets.batch_shape):
             return self._solve_generally(theta, sets)
+        v, lam, active, weak, info, convinces = map(torch.from_numpy, quick)
+        solved = Solved(v, lam, active, info, None if sets.is_box else weak)
         rest = (~convinces).nonzero()[:, 0]
         part = sets.of_samples(rest) if isinstance(sets, Bounds) else sets
         solved.put(rest, self._solve_generally(theta[rest], part))
