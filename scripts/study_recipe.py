@@ -185,7 +185,7 @@ def plot(path: Path, rows: Sequence[dict[str, str]], seeds: Sequence[int]) -> No
     for marker, colour, label in LOOKS.values():
         axes.plot([], [], marker, color=colour, linestyle="-", label=label)
     axes.legend(loc="lower right", frameon=True)
-    axes.set_title(f"what decides the factor: ratio of means over {len(seeds)} seeds, 95 % paired bootstrap intervals")
+    figure.suptitle(f"ratio of means over {len(seeds)} seeds, bars: 95 % paired bootstrap intervals", fontsize=10)
     figure.savefig(path)
     plt.close(figure)
 

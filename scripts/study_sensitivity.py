@@ -24,7 +24,7 @@ from scripts.experiments.case import Case, run_seed
 from scripts.experiments.masses import Masses
 from scripts.experiments.quadrotor import Quadrotor
 from scripts.shared.command import arguments, run_all, versions
-from scripts.shared.plots import COLOURS, NAMES, draw_band, percent, plt, style
+from scripts.shared.plots import COLOURS, NAMES, draw_band, percent, plt, say_band, style
 from scripts.shared.rows import Array, Rows, grid, read_rows, write_rows
 from scripts.shared.statistics import NOMINAL, POISON, RANDOM, band
 
@@ -94,6 +94,7 @@ def plot(path: Path, rows: Rows) -> None:
         if nominal > 1e-6:
             above.axhline(nominal, color=COLOURS[NOMINAL], linestyle=(0, (4, 2)), label=NAMES[NOMINAL])
         above.set(title=TITLES[plant], xscale="log", yscale="log", ylabel="mean tracking error [m]")
+        say_band(above, len(np.unique(chosen["seed"])))
         below.set(xlabel=r"$\rho$ [%]", ylabel="failed [%]", ylim=(0, 100), yticks=(0, 50, 100))
         below.xaxis.set_major_formatter(lambda value, _: f"{value:g}")
     figure.legend(*panels[0, 1].get_legend_handles_labels(), loc="outside upper center", ncols=3)

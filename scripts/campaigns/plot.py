@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from scripts.shared.plots import draw_band, plt, style
+from scripts.shared.plots import draw_band, plt, say_band, style
 
 COLOURS = {"random": "#0072b2", "algorithm1": "#d55e00", "projected_gradient": "#009e73", "frank_wolfe": "#cc79a7"}
 NAMES = {
@@ -43,6 +43,7 @@ def plot(path: Path, table: Any) -> None:
                 axes.axhline(np.median(nominal), **look)
         axes.set(title=TITLES[plant], xlabel=r"$\rho$ [%]", ylim=(0, None), xlim=(0, None))
     panels[0, 0].set_ylabel("mean tracking error [m]")
+    say_band(panels[0, 0], len(set(columns["seed"].tolist())))
     handles = {label: handle for axes in panels[0] for handle, label in zip(*axes.get_legend_handles_labels())}  # noqa: B905
     figure.legend(handles.values(), handles, loc="outside upper center", ncols=2, fontsize=9)
     figure.savefig(path)

@@ -1,8 +1,9 @@
-"""Rows on disk: one Parquet file a finished chunk, put in place by one rename, and one table at the end."""
+"""Rows on disk: one Parquet file with a checksum for each finished chunk, and one table at the end."""
 
 from __future__ import annotations
 
 import hashlib
+import logging
 import os
 from collections.abc import Sequence
 from pathlib import Path
@@ -12,6 +13,7 @@ import pyarrow as pa
 import pyarrow.parquet as pq
 
 from scripts.campaigns.config import RunConfig
+from torch_dpc.files import write_whole
 
 SCHEMA = pa.schema(
     [
@@ -41,8 +43,9 @@ SCHEMA = pa.schema(
 class Store:
     """The rows of a campaign in a folder.
 
-    A part is written under another name, synchronised and renamed, so that it is there whole or not at all. Its name
-    is made of the ids of its rows, so a chunk that is run twice leaves one part.
+    A part is there whole or not at all. Its name is made of the ids of its rows and of a checksum of its content. A
+    part whose content does not match its checksum is set aside with a warning, under the ending `.damaged`, and its
+    rows are run again.
     """
 
     def __init__(self, folder: Path):
@@ -53,16 +56,21 @@ class Store:
 
     def add(self, rows: Sequence[dict[str, Any]]) -> None:
         """Save the rows of a finished chunk."""
-        name = hashlib.sha256("".join(sorted(row["id"] for row in rows)).encode()).hexdigest()[:20]
-        unfinished = self.folder / f"{name}.{os.getpid()}.tmp"
-        pq.write_table(pa.Table.from_pylist(list(rows), schema=SCHEMA), unfinished)
-        with unfinished.open("rb") as file:
-            os.fsync(file.fileno())
-        os.replace(unfinished, self.folder / f"{name}.parquet")
+        name = _digest("".join(sorted(row["id"] for row in rows)).encode())
+        content = _as_bytes(pa.Table.from_pylist(list(rows), schema=SCHEMA))
+        write_whole(self.folder / f"{name}-{_digest(content)}.parquet", content)
 
     def parts(self) -> list[Path]:
-        """Return the parts, in a fixed order."""
-        return sorted(self.folder.glob("*.parquet"))
+        """Return the parts that are whole, in a fixed order; damaged ones are set aside."""
+        return [part for part in sorted(self.folder.glob("*.parquet")) if self._is_whole(part)]
+
+    def _is_whole(self, part: Path) -> bool:
+        if part.stem.rpartition("-")[2] == _digest(part.read_bytes()):
+            return True
+        aside = part.with_suffix(".damaged")
+        os.replace(part, aside)
+        logging.getLogger(__name__).warning("%s is damaged: set aside as %s, its rows run again", part, aside.name)
+        return False
 
     def finished(self) -> set[str]:
         """Return the ids of the rows that are there."""
@@ -82,7 +90,15 @@ class Store:
         rows = {row["id"]: row for part in self.parts() for row in pq.read_table(part).to_pylist()}
         ordered = [rows[config.id] | {"weights": config.weights} for config in configs if config.id in rows]
         table = pa.Table.from_pylist(ordered, schema=SCHEMA.with_metadata({"note": note}))
-        unfinished = path.with_suffix(".tmp")
-        pq.write_table(table, unfinished)
-        os.replace(unfinished, path)
+        write_whole(path, _as_bytes(table))
         return table
+
+
+def _as_bytes(table: pa.Table) -> bytes:
+    sink = pa.BufferOutputStream()
+    pq.write_table(table, sink)
+    return sink.getvalue().to_pybytes()
+
+
+def _digest(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()[:20]

@@ -64,6 +64,8 @@ def plot(path: Path, errors: Mapping[float, Sequence[float]]) -> None:
         axes.semilogy(t, np.median(around, axis=1), color=colour, linewidth=1.1, label=label)
     axes.axvline(0.1 * CHANGE, color="grey", linewidth=1, linestyle=(0, (4, 2)))
     axes.annotate("the springs double", (0.1 * CHANGE, 6e-4), (4, 0), textcoords="offset points")
+    text = f"one run each, running median of {SMOOTH} steps ({0.1 * SMOOTH:.1f} s)"
+    axes.text(0.98, 0.97, text, transform=axes.transAxes, ha="right", va="top", fontsize=8, color="0.3")
     axes.set(xlabel="time [s]", ylabel="distance to the reference [m]", xlim=(0, t[-1]), ylim=(5e-4, 2))
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=2)
     figure.savefig(path)

@@ -11,11 +11,12 @@ import matplotlib
 matplotlib.use("Agg")  # files only: no display needed
 
 import matplotlib.pyplot as plt  # noqa: E402
+import numpy as np  # noqa: E402
 from matplotlib.axes import Axes  # noqa: E402
 from matplotlib.ticker import MultipleLocator  # noqa: E402
 
 from scripts.shared.rows import Array, Rows, grid
-from scripts.shared.statistics import NOMINAL, POISON, RANDOM, band
+from scripts.shared.statistics import BAND, NOMINAL, POISON, RANDOM, band
 
 # Light to dark as rho grows, and apart in hue as well, for every kind of colour vision and in grey.
 RHO_COLOURS = ("#f2a33a", "#c8407a", "#35178c")
@@ -54,6 +55,12 @@ def draw_band(axes: Axes, x: Array, values: Array, **line: Any) -> None:
     axes.fill_between(x, low, high, color=drawn.get_color(), alpha=0.2, linewidth=0)
 
 
+def say_band(axes: Axes, seeds: int) -> None:
+    """Write inside the axes what lines and bands are."""
+    text = f"median of {seeds} seeds, band: {BAND[0]}th to {BAND[1]}th percentile"
+    axes.text(0.02, 0.97, text, transform=axes.transAxes, va="top", fontsize=8, color="0.3")
+
+
 def percent(rho: float) -> str:
     """Return rho as a percentage with two digits."""
     return f"{float(f'{100 * rho:.2g}'):g} %"
@@ -76,6 +83,7 @@ def error_panels(path: Path, rows: Rows, rhos: Sequence[float], ylabel: str) -> 
     panels[0].xaxis.set_major_locator(MultipleLocator(5))
     panels[0].set_ylabel(ylabel)
     panels[0].set_ylim(bottom=-0.02 * panels[0].get_ylim()[1])  # room for a line at zero
+    say_band(panels[0], len(np.unique(rows["seed"])))
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
     figure.savefig(path)
     plt.close(figure)

@@ -187,6 +187,38 @@ def test_a_changed_weight_runs_its_own_rows_only(small, tmp_path):
     assert set(table["weights"].to_pylist()) == {"renamed", "strict"}
 
 
+# --- damage ---------------------------------------------------------------------------------------------------------
+
+
+def finished_campaign(small, folder):
+    configs, store = config.load(small), Store(folder)
+    with open_backend("local", None, 1) as backend:
+        campaign.run_campaign(configs, store, backend)
+    return configs, store
+
+
+def test_a_damaged_part_is_set_aside_and_its_rows_are_run_again(small, tmp_path, caplog):
+    configs, store = finished_campaign(small, tmp_path / "parts")
+    part, rows = store.parts()[0], len(stored(store))
+    whole = part.read_bytes()
+    cuts = [whole[: len(whole) * k // 20] for k in range(20)]
+    bits = [
+        bytes([*whole[:i], whole[i] ^ 1 << (i % 8), *whole[i + 1 :]]) for i in range(0, len(whole), len(whole) // 50)
+    ]
+    for content in [*cuts, *bits, b"PAR1", whole + b"\0"]:
+        part.write_bytes(content)
+        missing = store.missing(configs)
+        assert 0 < len(missing) < rows and not part.exists() and part.with_suffix(".damaged").exists()
+        part.with_suffix(".damaged").unlink()
+        part.write_bytes(whole)
+    assert "is damaged: set aside" in caplog.text
+    part.write_bytes(whole[:-1])
+    with open_backend("local", None, 1) as backend:
+        campaign.run_campaign(configs, store, backend)
+    assert is_complete(store, configs)
+    assert store.merge(configs, tmp_path / "all.parquet", "")["id"].to_pylist() == [c.id for c in configs]
+
+
 # --- engines --------------------------------------------------------------------------------------------------------
 
 
