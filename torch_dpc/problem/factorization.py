@@ -36,12 +36,14 @@ class CostFactor:
         Q: orthonormal columns cut to the rows of E, `(..., k, n_x)`.
         order: the columns of E in the order of T, `(..., n_x)`.
         kernel: orthonormal basis of the kernel of E, in the order of T, `(..., n_x, n_k)`; padded with zero columns.
+        charge: weight of the kernel in T, `(..., 1, 1)`.
     """
 
     T: Tensor
     Q: Tensor
     order: Tensor
     kernel: Tensor
+    charge: Tensor
 
 
 def factor_cost(E: Tensor) -> CostFactor:
@@ -50,14 +52,14 @@ def factor_cost(E: Tensor) -> CostFactor:
     Q, T, order = _row_stable_qr(E)
     K = _kernel_of(E, T)
     if K.shape[-1] == 0:
-        return CostFactor(T, Q, order, K)
+        return CostFactor(T, Q, order, K, E.new_ones(*E.shape[:-2], 1, 1))
     count = (K != 0).any(-2).sum(-1)
     pivots = T.diagonal(dim1=-2, dim2=-1).abs()
     last = (n - 1 - count).clamp_min(0)[..., None]
     smallest = torch.where(count < n, pivots.gather(-1, last.clamp_max(pivots.shape[-1] - 1))[..., 0], 1.0)
     charge = TIE_BREAK * smallest[..., None, None]
     Q, T, order = _row_stable_qr(torch.cat([E - (E @ K) @ K.mT, charge * K.mT], dim=-2))
-    return CostFactor(T, Q[..., :k, :], order, K.gather(-2, order[..., None].expand_as(K)))
+    return CostFactor(T, Q[..., :k, :], order, K.gather(-2, order[..., None].expand_as(K)), charge)
 
 
 def _row_stable_qr(E: Tensor) -> tuple[Tensor, Tensor, Tensor]:

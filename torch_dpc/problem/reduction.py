@@ -46,7 +46,9 @@ class Reduction:
         Ct: its factor, `(..., N, n_x)`.
         A_theta, A_lam: a = A_theta theta - A_lam lam, `(..., r, n_theta)` and `(..., r, N)`.
         T, Z: the triangle of the cost and a basis of the kernel of Eq, a = Eq^+ e + Z x, `(..., r, n_x)`.
-        kernel: how the directions in which the cost is flat move v, `(..., N, n_k)`.
+        kernel: how the directions w in which the cost is flat move v, `(..., N, n_k)`, and
+        kernel_in_a: how they move a, `(..., r, n_k)`.
+        gain: they are charged 1/2 |w|^2 / gain, so that w = -gain kernel' lam, `(..., 1, 1)`.
         error: errors of v, then of Eq a = e, in their units, as the verification bounds them: for a unit of theta, and
             for multipliers that displace v by a unit, `(..., N + n_eq, 2)`.
         excess: [V, -G] minus the exact map, `(..., N, n_theta + N)`, where extended precision was needed; else None.
@@ -63,6 +65,8 @@ class Reduction:
     T: Tensor
     Z: Tensor
     kernel: Tensor
+    kernel_in_a: Tensor
+    gain: Tensor
     error: Tensor
     excess: Tensor | None
     rows: DataRows
@@ -162,7 +166,7 @@ def _values(rows: DataRows, weights: Weights) -> Reduction:
     T, batch = factor.T, E.shape[:-2]
     Z = rows.Z.expand(*batch, *rows.Z.shape[-2:])
     Z = Z.gather(-1, factor.order[..., None, :].expand_as(Z))
-    CZ = _without_rounding(rows.C @ Z, rows.C)
+    CZ, kernel = _moved_by(factor.kernel, _without_rounding(rows.C @ Z, rows.C), rows.tolerance)
     Ct = torch.linalg.solve_triangular(T, CZ, upper=True, left=False)
     X_theta = torch.linalg.solve_triangular(T, factor.Q.mT @ f, upper=True)
     # One step of refinement: it matters where weights of zero leave E a condition of 1e10.
@@ -171,9 +175,23 @@ def _values(rows: DataRows, weights: Weights) -> Reduction:
     A_theta = Z @ X_theta
     A_theta[..., :, rows.Eq_theta] += rows.Eq_pinv
     A_lam = Z @ torch.linalg.solve_triangular(T, Ct.mT, upper=True)
-    V, G, kernel = rows.C @ A_theta, Ct @ Ct.mT, CZ @ factor.kernel
-    none = V.new_zeros(*batch, 0, 2)
-    return _verified(Reduction(V, G, Ct, A_theta, A_lam, T, Z, kernel, none, None, rows, weights), factor.kernel)
+    reduction = Reduction(
+        V=rows.C @ A_theta,
+        G=Ct @ Ct.mT,
+        Ct=Ct,
+        A_theta=A_theta,
+        A_lam=A_lam,
+        T=T,
+        Z=Z,
+        kernel=kernel,
+        kernel_in_a=Z @ factor.kernel,
+        gain=factor.charge.square().reciprocal(),
+        error=T.new_zeros(*batch, 0, 2),
+        excess=None,
+        rows=rows,
+        weights=weights,
+    )
+    return _verified(reduction, factor.kernel)
 
 
 def _verified(reduction: Reduction, kernel: Tensor) -> Reduction:
@@ -251,6 +269,16 @@ def _map_of(flat: Reduction, i: int, kernel: Tensor) -> Map:
         kernel=kernel.cpu().numpy(),
         Eq_pinv=Eq_pinv.cpu().numpy(),
     )
+
+
+def _moved_by(kernel: Tensor, CZ: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
+    """Return C Z and how the kernel of the cost `(..., n_x, n_k)` moves v, zero on the rows that it hardly moves.
+
+    A row that the cost charges is one: its rounding, over the small charge of the kernel, would stand for a motion.
+    """
+    norm, moved = torch.linalg.vector_norm, CZ @ kernel
+    hardly = (norm(moved, dim=-1) <= tolerance * norm(CZ, dim=-1))[..., None]
+    return CZ - torch.where(hardly, moved, 0.0) @ kernel.mT, torch.where(hardly, 0.0, moved)
 
 
 def _without_rounding(product: Tensor, rows: Tensor) -> Tensor:

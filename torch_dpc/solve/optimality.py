@@ -99,6 +99,7 @@ class Optimality:
         diagonal = reduction.G.diagonal(dim1=-2, dim2=-1).contiguous()
         self._V, self._G, self.diagonal = array(reduction.V), array(reduction.G), array(diagonal)
         self._kernel = array(reduction.kernel) if reduction.is_selection else None
+        self._pull = array(reduction.gain[..., 0] * reduction.kernel.abs().amax(-2))  # of lam's work, on v
         self._per_theta, self._moved = array(1 / reduction.rows.theta_scale), array(diagonal / reduction.scale)
         worst = reduction.error.amax(-2)
         self._error = (float(worst[0]), float(worst[1])) if worst.ndim == 1 else worst.unbind(-1)
@@ -141,8 +142,10 @@ class Optimality:
         residual = self._largest(missed) + error
         if self._kernel is None:
             return residual
-        work, terms = self._combine(lam, self._kernel), self._combine(abs(lam), abs(self._kernel))
-        return residual + self._largest(abs(work) / (terms + _TINY))
+        # None, relative to its terms; or so little that taking the charge away would not move a row.
+        work, terms = abs(self._combine(lam, self._kernel)), self._combine(abs(lam), abs(self._kernel))
+        relative, pull = self._largest(work / (terms + _TINY)), self._largest(work * self._pull)
+        return residual + relative * (pull >= relative) + pull * (pull < relative)
 
 
 def _times(matrix: Any, x: Any) -> Any:

@@ -129,16 +129,26 @@ class Recovery:
         return times(torch.linalg.pinv(D, rtol=reduction.rows.tolerance), times(D @ basis, a))
 
     def _rounding_of(self, a: Tensor) -> Tensor:
-        """Return the least change of a that brings Up g, Uf g, Yf g onto u_ini, u, y: what large multipliers round."""
+        """Return the least change of a that brings Up g, Uf g, Yf g onto u_ini, u, y: what large multipliers round.
+
+        Where the cost has a kernel the plan may have moved along it: that comes first, for it changes no cost.
+        """
         with torch.no_grad():
-            rows, theta = self.reduction.detach().rows, self.theta.detach()
+            reduction, a, theta = self.reduction.detach(), a.detach(), self.theta.detach()
+            rows = reduction.rows
             v = torch.cat([x.detach().flatten(-2) for x in (self.planned.u, self.planned.y)], dim=-1)
             n = v.shape[-1]
+            along = torch.zeros_like(a)
+            if reduction.is_selection:
+                per = 1 / rows.scale[..., :n]
+                K = reduction.kernel[..., :n, :] * per[..., None]
+                w = times(torch.linalg.pinv(K, rtol=rows.tolerance), (v - times(rows.C[..., :n, :], a)) * per)
+                along = times(reduction.kernel_in_a, torch.nan_to_num(w))
             wanted = torch.cat([theta[..., rows.Eq_theta].expand(*v.shape[:-1], -1), v], dim=-1)
             held = torch.cat([rows.Eq, rows.C[..., :n, :]], dim=-2)
             unit = torch.cat([rows.theta_scale[..., rows.Eq_theta], rows.scale[..., :n]], dim=-1)
-            missed = torch.nan_to_num((wanted - times(held, a.detach())) / unit)
-            return times(torch.linalg.pinv(held / unit[..., None], rtol=rows.tolerance), missed)
+            missed = torch.nan_to_num((wanted - times(held, a + along)) / unit)
+            return along + times(torch.linalg.pinv(held / unit[..., None], rtol=rows.tolerance), missed)
 
     def _value(self) -> Tensor:
         planned = self.planned

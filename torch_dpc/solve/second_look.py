@@ -37,20 +37,23 @@ class SecondLook:
         values = torch.cat([r.V, -r.G], dim=-1).cpu().numpy().astype(np.longdouble)
         return values if r.excess is None else values - r.excess.cpu().numpy()
 
-    def polished(self, theta: Tensor, lam: Tensor, step: Callable[[Tensor, Tensor], Tensor]) -> tuple[Tensor, Tensor]:
-        """Return multipliers and their V theta - G lam, rounded once, `(*batch, N)` each.
+    def polished(
+        self, theta: Tensor, lam: Tensor, moved: Tensor, step: Callable[[Tensor, Tensor], Tensor]
+    ) -> tuple[Tensor, Tensor]:
+        """Return multipliers and their V theta + moved - G lam, rounded once, `(*batch, N)` each.
 
         Args:
             theta, lam: of the samples.
-            step: (V theta - G lam, lam) -> Newton's step on the multipliers.
+            moved: along the kernel of the cost, `(*batch, N)` or a zero.
+            step: (V theta + moved - G lam, lam) -> Newton's step on the multipliers.
         """
         rest = torch.zeros_like(lam)
-        raw = self._raw(theta, lam, rest)
+        raw = self._raw(theta, lam, rest) + moved
         for _ in range(ROUNDS):
             change = rest + step(raw, lam)
-            moved = lam + change
-            lam, rest = moved, change - (moved - lam)
-            raw = self._raw(theta, lam, rest)
+            new = lam + change
+            lam, rest = new, change - (new - lam)
+            raw = self._raw(theta, lam, rest) + moved
         return lam, raw
 
     def _raw(self, theta: Tensor, lam: Tensor, rest: Tensor) -> Tensor:

@@ -49,6 +49,7 @@ class SingleSolver:
     ) -> SingleSolver | None:
         """Return the solver; None for a batch of problems, idle inputs, sets that are no boxes, or a GPU."""
         plain = reduction.G.ndim == 2 and reduction.rows.Eq_range is None and engines.structure is None
+        plain = plain and not reduction.is_selection
         if not plain or reduction.G.device.type != "cpu":
             return None
         return SingleSolver(reduction, in_units, sizes, engines, unit)

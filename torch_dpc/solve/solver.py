@@ -30,6 +30,7 @@ from .optimality import BATCHED, Optimality
 from .outcome import ACCEPTANCE, Planned, Solved, check_finite, joined, report_failures
 from .projected_system import newton_step
 from .second_look import SecondLook
+from .selection import uncharged
 from .single import SingleSolver
 from .weakness import WEAKLY_ACTIVE, is_without_multiplier
 
@@ -187,26 +188,31 @@ class Solver:
 
     def _attempt(self, engine: str, theta: Tensor, v0: Tensor, sets: Sets) -> tuple[Solved, Tensor | None]:
         """Run one engine and judge what it found; return the gap that it saw as well."""
-        found = self.engines.run(engine, v0, sets)
+        if self.reduction.is_selection:
+            found, moved = uncharged(self.reduction, v0, partial(self.engines.run, engine, sets=sets))
+            v0 = v0 + moved
+        else:
+            found, moved = self.engines.run(engine, v0, sets), torch.zeros(())
         raw, error = self.optimality.displaced(v0, found.lam), self.optimality.error(theta, found.lam)
         solved = self._judged(raw, found.lam, sets, error, found.iterations)
         doubtful = ~(solved.info[..., 2] <= ACCEPTANCE.convincing)
         if bool(doubtful.any()):
-            self._look_again(solved, theta, sets, doubtful)
+            self._look_again(solved, theta, moved, sets, doubtful)
         solved.info[..., 0][self.reduction.rows.unreachable(theta)] = int(Status.FAILED)
         return solved, found.gap
 
-    def _look_again(self, solved: Solved, theta: Tensor, sets: Sets, doubtful: Tensor) -> None:
+    def _look_again(self, solved: Solved, theta: Tensor, moved: Tensor, sets: Sets, doubtful: Tensor) -> None:
         """Judge doubtful samples anew by the map in extended precision, their multipliers polished."""
         if isinstance(sets, FeasibleSet) and sets.batch_shape:
             solver, before, where = self, solved, doubtful  # the sets cannot be had sample by sample: all of them
         else:
             where = doubtful.nonzero()[:, 0]
             solver, theta, before = self._of_samples(where), theta[where], solved.map(lambda x: x[where])
+            moved = moved[where] if moved.ndim else moved
         if isinstance(sets, Bounds):
             sets = sets.of_samples(where)
         step = partial(solver._step, sets=sets, held=before.lam != 0)
-        lam, raw = SecondLook(solver.reduction).polished(theta, before.lam, step)
+        lam, raw = SecondLook(solver.reduction).polished(theta, before.lam, moved, step)
         judged = solver._judged(raw, lam, sets, torch.zeros_like(lam[..., 0]), before.info[..., 1])
         better = judged.info[..., 2] < before.info[..., 2]
         better = better & doubtful if where is doubtful else better
