@@ -15,6 +15,7 @@ from .recordings import hankel
 #: Singular values at or below this fraction of the largest count as zero. Double-precision recordings of a
 #: noise-free system leave about 1e-15; single-precision ones carry rounding of 6e-8 a sample.
 RANK_TOLERANCE = {torch.float64: 1e-10, torch.float32: 1e-5}
+_TINY = torch.finfo(torch.float64).tiny
 #: The same for recordings of half precision.
 HALF_PRECISION_TOLERANCE = 1e-2
 
@@ -50,10 +51,17 @@ def excitation_order(recordings: list[Tensor]) -> int:
 
 
 def has_full_row_rank(matrix: Tensor, tolerance: float) -> bool:
-    """Return whether the smallest singular value exceeds a fraction of the largest."""
+    """Return whether the smallest singular value exceeds a fraction of the largest, the rows at unit length.
+
+    Rows at unit length have no units: an input in micrometres beside one in kilometres excites as much.
+    """
     if matrix.shape[0] > matrix.shape[1]:
         return False
-    R = torch.linalg.qr(matrix.double().T, mode="r").R
+    rows = matrix.double()
+    length = torch.linalg.vector_norm(rows / rows.abs().amax().clamp_min(_TINY), dim=1, keepdim=True)
+    if not bool((length > 0).all()):
+        return False
+    R = torch.linalg.qr((rows / (length * rows.abs().amax())).T, mode="r").R
     singular = torch.linalg.svdvals(R)
     return bool(singular[-1] > tolerance * singular[0])
 

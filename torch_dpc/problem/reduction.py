@@ -265,7 +265,7 @@ def _map_of(flat: Reduction, i: int, kernel: Tensor) -> Map:
         values=np.concatenate([V, -G], axis=1),
         A=np.concatenate([A_theta, -A_lam], axis=1),
         T=T,
-        Ct=Ct,
+        CZ=Ct @ T,
         kernel=kernel.cpu().numpy(),
         Eq_pinv=Eq_pinv.cpu().numpy(),
     )

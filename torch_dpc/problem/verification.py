@@ -107,7 +107,7 @@ class Map:
     Attributes:
         values: [V, -G], `(N, m)`.
         A: [A_theta, -A_lam], `(r, m)`; in extended precision while it is corrected.
-        T, Ct: the triangle of the cost, and C Z T^-1.
+        T, CZ: the triangle of the cost, and C Z.
         kernel: orthonormal basis of the kernel of the cost in x, `(n_x, n_k)`.
         Eq_pinv: the pseudo-inverse of Eq.
     """
@@ -115,7 +115,7 @@ class Map:
     values: Array
     A: Array
     T: Array
-    Ct: Array
+    CZ: Array
     kernel: Array
     Eq_pinv: Array
 
@@ -157,7 +157,7 @@ def verify(posed: Posed, found: Map, settings: VerificationSettings = SETTINGS) 
 def _check(posed: Posed, found: Map, settings: VerificationSettings) -> Verdict:
     """Check in double precision. An error that a rounding of the data explains is none."""
     slope, size = posed.slope(found.A)
-    excess = np.abs(found.values - posed.C @ found.A + found.Ct @ _translated(found, slope))
+    excess = np.abs(found.values - posed.C @ found.A + found.CZ @ _moved(found, slope))
     own, missed = settings.rounding * np.abs(found.values), np.abs(posed.missed(found.A))
     of_v, of_eq = (settings.rounding * bound for bound in _rounding(posed, found, size))
     unexplained = excess > settings.explained * of_v, missed > settings.explained * of_eq
@@ -173,6 +173,7 @@ def _rounding(posed: Posed, found: Map, size: Array) -> tuple[Array, Array]:
         size: of the terms of the slope, `(m,)`.
     """
     norm = np.linalg.norm
+    back = solve_triangular(found.T, _off_kernel(found, found.CZ.T), trans="T") if found.CZ.size else found.CZ.T
     length, own = norm(found.A, axis=0), np.abs(found.values)
     reached = norm(posed.C, axis=1)
     for term in posed.terms:  # a term that is off by its rounding moves v as its target does, which the map says
@@ -181,9 +182,8 @@ def _rounding(posed: Posed, found: Map, size: Array) -> tuple[Array, Array]:
             reached = reached + own[:, term.start : term.start + len(rows)] @ rows
         else:
             weight = np.einsum("ij,ij->", term.S, term.W @ term.S if term.W.ndim else term.W * term.S)
-            reached = reached + norm(found.Ct, axis=1) * np.sqrt(weight)
-    moved = solve_triangular(found.T, found.Ct.T)
-    moved = norm(moved - found.kernel @ (found.kernel.T @ moved), axis=0)
+            reached = reached + norm(back, axis=0) * np.sqrt(weight)
+    moved = norm(_off_kernel(found, solve_triangular(found.T, back)), axis=0)
     of_eq = norm(posed.Eq, axis=1) / posed.theta_scale[posed.places]
     return reached[:, None] * length + moved[:, None] * size + own, (of_eq[:, None] + 1) * (length + 1)
 
@@ -192,7 +192,7 @@ def _check_extended(posed: Posed, extended: Posed, found: Map, settings: Verific
     """Check in extended precision."""
     A = found.A.astype(np.longdouble)
     slope, _ = extended.slope(A)
-    excess = found.values - extended.C @ A + found.Ct @ _translated(found, slope.astype(float))
+    excess = found.values - extended.C @ A + found.CZ @ _moved(found, slope.astype(float))
     rounding = settings.rounding * np.abs(found.values)  # of values (theta, lam), in every sample
     missed = np.abs(extended.missed(A)).astype(float)
     error = _in_units(posed, found, np.abs(excess).astype(float) + rounding, missed)
@@ -205,14 +205,20 @@ def _corrected(extended: Posed, found: Map) -> Map:
     missed = extended.missed(A).astype(float) * extended.theta_scale[extended.places, None]
     A = A - found.Eq_pinv @ missed
     slope, _ = extended.slope(A)
-    A = A - extended.Z @ solve_triangular(found.T, _translated(found, slope.astype(float)))
+    A = A - extended.Z @ _moved(found, slope.astype(float))
     return replace(found, A=A, values=(extended.C @ A).astype(float))
 
 
-def _translated(found: Map, slope: Array) -> Array:
-    """Return T'^-1 times the slope; what falls on the kernel of the cost is left out, for it moves no cost."""
-    rest = slope - found.kernel @ (found.kernel.T @ slope)
-    return solve_triangular(found.T, rest, trans="T") if rest.size else rest
+def _moved(found: Map, slope: Array) -> Array:
+    """Return (T'T)^-1 slope, by how much x is off, without what falls on the kernel of the cost: that moves no cost."""
+    if not slope.size:
+        return slope
+    weighted = solve_triangular(found.T, _off_kernel(found, slope), trans="T")
+    return _off_kernel(found, solve_triangular(found.T, weighted))
+
+
+def _off_kernel(found: Map, x: Array) -> Array:
+    return x - found.kernel @ (found.kernel.T @ x)
 
 
 def _in_units(posed: Posed, found: Map, of_v: Array, of_eq: Array) -> Array:

@@ -17,7 +17,7 @@ from ..errors import Status
 from ..problem.cost import mismatch, optimal_cost
 from ..problem.reduction import Reduction
 from .engines import Sets
-from .outcome import Planned, joined
+from .outcome import ACCEPTANCE, Planned, joined
 from .solver import Solver
 
 #: The results that a plan computes when asked.
@@ -129,26 +129,27 @@ class Recovery:
         return times(torch.linalg.pinv(D, rtol=reduction.rows.tolerance), times(D @ basis, a))
 
     def _rounding_of(self, a: Tensor) -> Tensor:
-        """Return the least change of a that brings Up g, Uf g, Yf g onto u_ini, u, y: what large multipliers round.
+        """Return the change of a that brings Uf g and Yf g onto u and y, where they differ by more than is accepted.
 
-        Where the cost has a kernel the plan may have moved along it: that comes first, for it changes no cost.
+        Large multipliers round g by more than they round the plan. Where the cost has a kernel the plan may have moved
+        along it: that comes first, for it changes no cost; the rest changes the cost by as little as can be.
         """
         with torch.no_grad():
-            reduction, a, theta = self.reduction.detach(), a.detach(), self.theta.detach()
-            rows = reduction.rows
+            reduction, a = self.reduction.detach(), a.detach()
             v = torch.cat([x.detach().flatten(-2) for x in (self.planned.u, self.planned.y)], dim=-1)
             n = v.shape[-1]
-            along = torch.zeros_like(a)
+            per = 1 / reduction.scale[..., :n]
+            C = reduction.rows.C[..., :n, :]
+            missed = torch.nan_to_num((v - times(C, a)) * per)
+            change = torch.zeros_like(a)
             if reduction.is_selection:
-                per = 1 / rows.scale[..., :n]
-                K = reduction.kernel[..., :n, :] * per[..., None]
-                w = times(torch.linalg.pinv(K, rtol=rows.tolerance), (v - times(rows.C[..., :n, :], a)) * per)
-                along = times(reduction.kernel_in_a, torch.nan_to_num(w))
-            wanted = torch.cat([theta[..., rows.Eq_theta].expand(*v.shape[:-1], -1), v], dim=-1)
-            held = torch.cat([rows.Eq, rows.C[..., :n, :]], dim=-2)
-            unit = torch.cat([rows.theta_scale[..., rows.Eq_theta], rows.scale[..., :n]], dim=-1)
-            missed = torch.nan_to_num((wanted - times(held, a + along)) / unit)
-            return along + times(torch.linalg.pinv(held / unit[..., None], rtol=rows.tolerance), missed)
+                w = _solved(reduction.kernel[..., :n, :] * per[..., None], missed)
+                change = times(reduction.kernel_in_a, w)
+                missed = torch.nan_to_num((v - times(C, a + change)) * per)
+            x = _solved(reduction.Ct[..., :n, :] * per[..., None], missed)
+            back = reduction.Z @ torch.linalg.inv(reduction.T) if x.shape[-1] else reduction.Z
+            is_off = (missed.abs() / (1 + (v * per).abs())).amax(-1, keepdim=True) > ACCEPTANCE.residual
+            return change + torch.where(is_off, times(back, x), 0.0)
 
     def _value(self) -> Tensor:
         planned = self.planned
@@ -168,3 +169,8 @@ class Recovery:
             fixed = (reduction.weights.lambda_g > 0) | self.data.spans_all.to(self.theta.device)
             decided = reduction.rows.Eq_range is None and not self.reduction.is_selection
             return self.solver.independent(self.planned, self.sets) & fixed & decided
+
+
+def _solved(matrix: Tensor, missed: Tensor) -> Tensor:
+    """Return the least x with matrix x = missed, as far as there is one."""
+    return times(torch.linalg.pinv(matrix, rtol=1e-13), missed)

@@ -245,11 +245,12 @@ class Solver:
         """Judge with the projection onto the sets; count the directions that D holds, block by block."""
         order, inverse, gamma = self.engines.order, self.engines.inverse, self.engines.gamma
         raw = raw[..., order]
-        lam_in_parts = lam[..., order]
-        v = sets.prox(raw + gamma * lam_in_parts, gamma)
+        lam_in_parts, diagonal = lam[..., order], self.engines.G_in_parts.diagonal(dim1=-2, dim2=-1)
+        # No multiplier moves a row that the equalities decide, and no price does.
+        step = torch.where(sets.largest_of_group(diagonal) > 0, gamma, 0.0)
+        v = sets.prox(raw + step * lam_in_parts, step)
         missed = (raw - v).abs() / (1 + sets.largest_of_coupled(v.abs()))
         residual = self.optimality.residual(lam, missed, error)
-        diagonal = self.engines.G_in_parts.diagonal(dim1=-2, dim2=-1)
         weak = sets.weak(v, is_without_multiplier(v, lam_in_parts, diagonal)).expand_as(v)
         d, _ = sets.spectral(sets.freed(sets.jacobians(v + gamma * lam_in_parts, gamma), weak))
         active = (d < HELD).expand_as(v)
