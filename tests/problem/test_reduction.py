@@ -43,7 +43,7 @@ def test_reduced_map_is_the_dense_kkt_system(noise):
     """v = V theta - G lam against [P H'; H 0] of a problem small and round enough for a dense solve."""
     layer = small_layer(noise)
     rows = DataRows.of(layer.data, CPU)
-    reduction = reduce(rows, layer._factored(CPU).problem.weights)
+    reduction = reduce(rows, layer.reduction.weights)
     u_ini, y_ini = windows(1, 3, seed=1)
     theta = torch.cat([u_ini.reshape(-1), y_ini.reshape(-1), HOLDING.repeat(6), Y_REF.repeat(6)])
     P, q, H, b = layer.compact_form(u_ini[0], y_ini[0], y_ref=Y_REF, u_ref=HOLDING)
