@@ -2,47 +2,31 @@
 
 from __future__ import annotations
 
-import contextlib
-import itertools
 import os
-import weakref
 from typing import Any
 
 import torch
-from torch import Tensor, nn
+from torch import Tensor
 
-from .checkpoints import restore, state_of
-from .checks import one_batch, reference, window, with_one_batch
+from .checks import one_batch
+from .configured import ConfiguredModule
 from .data.hankel import HankelData
 from .data.hankel_batch import HankelBatch
-from .factors import Factored, Factors, problem_of
+from .factors import Factored, problem_of
 from .problem.compact_form import CompactForm, compact_form
 from .problem.reduction import Reduction
-from .problem.terms import Sizes, Terms
 from .saving import load_layer, save_layer
-from .sets import ConvexSet
+from .sets import ConvexSet, Reals
 from .sets.bounds import Bounds
-from .sets.feasible import FeasibleSet
-from .settings import VALIDATORS, GivenWeights, Settings, Setup, check_choice
+from .settings import check_choice
 from .solution import DPCSolution, solution_of
 from .solve.derivative import plan
 from .solve.engines import Sets
 from .solve.recovery import Recovery
 from .tracing import batches_of, described, flat_parameters, planned_by_operator
 
-#: The layers of this process; compiled models find them by their handles.
-layers_by_handle: weakref.WeakValueDictionary[int, DPCLayer] = weakref.WeakValueDictionary()
-_handles = itertools.count()
 
-
-def register(layer: DPCLayer) -> int:
-    """Return a new handle of a layer."""
-    handle = next(_handles)
-    layers_by_handle[handle] = layer
-    return handle
-
-
-class DPCLayer(nn.Module):
+class DPCLayer(ConfiguredModule):
     """Plan a trajectory of the recorded system by one quadratic program, differentiably.
 
         minimise over u, y, g   1/2 |y - y_ref|_Q^2 + 1/2 |u - u_ref|_R^2 + lambda_g |M g|^2 + lambda_s |Yp g - y_ini|^2
@@ -110,15 +94,12 @@ class DPCLayer(nn.Module):
         on_failure: str = "raise",
     ):
         super().__init__()
-        self._setup_cache: tuple[Settings, Setup] | None = None
-        self._factors = Factors()
-        self._handle = register(self)
         self.data = data
         self.Q, self.R, self.lambda_g, self.lambda_s = Q, R, lambda_g, lambda_s
         self.lambda_u, self.R_du = lambda_u, R_du
-        self.u_set: ConvexSet = u_set  # type: ignore[assignment]
-        self.y_set: ConvexSet = y_set  # type: ignore[assignment]
-        self.du_set: ConvexSet | None = du_set
+        self.u_set = Reals() if u_set is None else u_set
+        self.y_set = Reals() if y_set is None else y_set
+        self.du_set = du_set
         self.regularizer = regularizer
         self.terminal_steps = terminal_steps
         self.backward_system = backward
@@ -129,72 +110,14 @@ class DPCLayer(nn.Module):
         self._factors.sets(self._setup, cpu)
         one_batch([*problem.batches, *self.feasible_set.batches(cpu)])
 
-    def __setattr__(self, name: str, value: Any) -> None:
-        """Assign; a setting is checked first, as the constructor checks it."""
-        validate = VALIDATORS.get(name)
-        super().__setattr__(name, value if validate is None else validate(name, value))
-
-    @property
-    def _setup(self) -> Setup:
-        """What follows from the settings, derived again when one of them has changed."""
-        now = Settings.of(self.__dict__)
-        kept = self._setup_cache
-        if kept is None or kept[0] != now:
-            kept = self._setup_cache = (now, Setup.of(now))
-        return kept[1]
-
-    @property
-    def _given(self) -> GivenWeights:
-        """The weights as they are now."""
-        return GivenWeights(self.Q, self.R, self.lambda_g, self.lambda_s, self.lambda_u, self.R_du)
-
     def factored(self, device: torch.device) -> Factored:
         """Return the reduced problem of the present weights and its solver."""
         return self._factors.factored(self._setup, self._given, device)
 
     @property
-    def backward(self) -> str:
-        """The system that the backward solves, "reduced" or "full"; may be assigned."""
-        return self.backward_system
-
-    @backward.setter
-    def backward(self, value: str) -> None:
-        self.backward_system = value
-
-    @property
-    def terms(self) -> Terms:
-        """Which terms the problem has beyond the paper's."""
-        return self._setup.terms
-
-    @property
-    def sizes(self) -> Sizes:
-        """The sizes of the parts of theta and of v."""
-        return self._setup.sizes
-
-    @property
     def reduction(self) -> Reduction:
         """The reduced problem of the present weights; see :mod:`torch_dpc.problem.reduction`."""
         return self.factored(self.data.device).reduction
-
-    @property
-    def feasible_set(self) -> FeasibleSet:
-        """All sets of the problem as one."""
-        return self._setup.sets
-
-    @property
-    def reduced_kkt_size(self) -> int:
-        """Unknowns of the reduced system: horizon (n_u + n_y), horizon n_u more where changes of the input count."""
-        return self.sizes.v
-
-    @property
-    def full_kkt_size(self) -> int:
-        """Unknowns of the paper's system: 2 horizon (n_u + n_y) + t_ini n_u + n_g.
-
-        Raises:
-            ValueError: the data sets of a batch have different n_g.
-        """
-        data = self.data
-        return 2 * data.horizon * (data.n_u + data.n_y) + data.t_ini * data.n_u + data.n_g
 
     def forward(
         self, u_ini: Any, y_ini: Any, *, y_ref: Any = None, u_ref: Any = None, on_failure: str | None = None
@@ -229,15 +152,6 @@ class DPCLayer(nn.Module):
         sizes = [data.horizon, data.n_u, data.n_y, data.horizon * data.n_u if rates else 0]
         on_failure = self.on_failure if on_failure is None else on_failure
         return planned_by_operator(theta, tensors, self._handle, text, on_failure, sizes, dtype)
-
-    def own_tensors(self) -> list[Tensor]:
-        """Return the weights that are tensors, then the parameters of the sets."""
-        weights = (self.Q, self.R, self.R_du, self.lambda_g, self.lambda_s, self.lambda_u)
-        sets = [self.u_set, self.y_set] if self.du_set is None else [self.u_set, self.y_set, self.du_set]
-        found = [weight for weight in weights if isinstance(weight, Tensor)]
-        for owner in sets:
-            found += list(owner.parameters())
-        return found
 
     def present_sets(self, device: torch.device) -> Sets:
         """Return the sets with their present parameters, as a solve takes them."""
@@ -295,25 +209,6 @@ class DPCLayer(nn.Module):
             raise ValueError("`compact_form` has no rows for changes of the input; leave out `du_set`.")
         return compact_form(self.data, weights, theta, self.terms)
 
-    def config(self) -> dict[str, Any]:
-        """Return the arguments of the constructor beyond the data, as they are now."""
-        return {
-            "Q": self.Q,
-            "R": self.R,
-            "lambda_g": self.lambda_g,
-            "lambda_s": self.lambda_s,
-            "u_set": self.u_set,
-            "y_set": self.y_set,
-            "du_set": self.du_set,
-            "R_du": self.R_du,
-            "lambda_u": self.lambda_u,
-            "regularizer": self.regularizer,
-            "terminal_steps": self.terminal_steps,
-            "backward": self.backward_system,
-            "solver": self.solver,
-            "on_failure": self.on_failure,
-        }
-
     def save(self, path: str | os.PathLike[str], *, data: bool = False) -> None:
         """Write the layer to a safetensors file: weights, sets, settings and the data, without pickle.
 
@@ -344,54 +239,3 @@ class DPCLayer(nn.Module):
         """
         layer: DPCLayer = load_layer(cls, path)
         return layer
-
-    def get_extra_state(self) -> Tensor:
-        """Return what `state_dict` holds besides parameters: compact data, settings and sets, as bytes."""
-        return state_of(self)
-
-    def set_extra_state(self, state: Tensor) -> None:
-        """Take over data, settings and sets of a checkpoint, so that the layer plans like the one that was saved.
-
-        Raises:
-            ValueError: the checkpoint does not fit.
-        """
-        restore(self, state)
-
-    def extra_repr(self) -> str:
-        """Describe the data and the sizes of the systems that are solved."""
-        sizes = ""
-        for name in ("reduced_kkt_size", "full_kkt_size"):
-            # Settings under change may not fit, and the data sets of a batch may differ: neither has a size to show.
-            with contextlib.suppress(ValueError):
-                sizes += f", {name}={getattr(self, name)}"
-        return (
-            f"{self.data!r}{sizes}, "
-            f"backward={self.backward_system!r}, solver={self.solver!r}, on_failure={self.on_failure!r}"
-        )
-
-    def flatten(self, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any) -> tuple[Tensor, torch.dtype]:
-        """Return (u_ini, y_ini, u_ref, y_ref) flattened, `(*batch, n_theta)` in float64, and the caller's dtype."""
-        data = self.data
-        u_ini = window("u_ini", u_ini, data.t_ini, data.n_u, "n_u")
-        y_ini = window("y_ini", y_ini, data.t_ini, data.n_y, "n_y")
-        parts = [
-            u_ini,
-            y_ini,
-            reference("u_ref", u_ref, data.horizon, data.n_u, "n_u", u_ini),
-            reference("y_ref", y_ref, data.horizon, data.n_y, "n_y", y_ini),
-        ]
-        dtype = u_ini.dtype if u_ini.dtype == y_ini.dtype else torch.promote_types(u_ini.dtype, y_ini.dtype)
-        if all(part.ndim == 2 for part in parts):
-            theta = torch.cat([part.reshape(-1) for part in parts])
-        else:
-            theta = torch.cat([part.flatten(-2) for part in with_one_batch(parts)], dim=-1)
-        return (theta if theta.dtype == torch.float64 else theta.double()), dtype
-
-    def __getstate__(self) -> dict[str, Any]:
-        """Leave the factors out of copies and pickles: they are made again when needed."""
-        return {**self.__dict__, "_factors": Factors(), "_setup_cache": None}
-
-    def __setstate__(self, state: dict[str, Any]) -> None:
-        """Give a copy a handle of its own."""
-        super().__setstate__(state)
-        self._handle = register(self)

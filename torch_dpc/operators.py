@@ -18,11 +18,12 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from .layer import DPCLayer, layers_by_handle
+from .layer import DPCLayer
 from .saving import layer_from_tree
 from .sets.feasible import places_of, snapshot_of
 from .solve.derivative import plan as plan_of
 from .solve.outcome import Planned
+from .tracing import layers_by_handle
 
 #: Layers of exported programs that are kept, by their text.
 MOST_LAYERS = 16
@@ -158,6 +159,7 @@ def _layer_of(tensors: list[Tensor], handle: int, text: str, leaves: list[Tensor
         found = layers_by_handle.get(handle)
         if found is None:
             raise RuntimeError("the layer that was compiled does not exist any more in this process.")
+        assert isinstance(found, DPCLayer)
         layer, own = found, found.own_tensors()
         if len(own) != len(tensors):
             raise RuntimeError("a weight of the layer became a tensor, or a number, after the model was compiled.")

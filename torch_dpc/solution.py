@@ -25,10 +25,11 @@ class SolveInfo:
     """How the solve of each sample went; every tensor has the batch's shape.
 
     Attributes:
-        is_selection: the cost does not fix g; u, y and g are those of the minimum-norm g.
+        is_selection: the cost does not fix g; u, y and g are those of the minimum-norm g. None in a compiled or exported
+            model, which does not tell.
     """
 
-    def __init__(self, table: Tensor, is_selection: bool, make_nonsingular: Callable[[], Tensor]):
+    def __init__(self, table: Tensor, is_selection: bool | None, make_nonsingular: Callable[[], Tensor]):
         self.table = table
         self.is_selection = is_selection
         self._make_nonsingular = make_nonsingular
@@ -242,22 +243,22 @@ def lost() -> Tensor:
     raise NotImplementedError("`nonsingular` was not computed before the plan was taken apart: ask for it earlier.")
 
 
-def _flatten(plan: DPCSolution) -> tuple[list[Any], tuple[bool, Later]]:
+def _flatten(plan: DPCSolution) -> tuple[list[Any], tuple[bool | None, Later]]:
     children = [plan.u, plan.y, plan.info.table, plan.lam, *plan._later.tensors]
     return children, (plan.info.is_selection, plan._later)
 
 
-def _unflatten(children: Iterable[Any], context: tuple[bool, Later]) -> DPCSolution:
+def _unflatten(children: Iterable[Any], context: tuple[bool | None, Later]) -> DPCSolution:
     u, y, table, lam, *own = children
     later = context[1].with_tensors(own)
     return DPCSolution(u, y, SolveInfo(table, context[0], lambda: later.make("nonsingular")), lam, later)
 
 
-def _flatten_info(info: SolveInfo) -> tuple[list[Any], bool]:
+def _flatten_info(info: SolveInfo) -> tuple[list[Any], bool | None]:
     return [info.table], info.is_selection
 
 
-def _unflatten_info(children: Iterable[Any], is_selection: bool) -> SolveInfo:
+def _unflatten_info(children: Iterable[Any], is_selection: bool | None) -> SolveInfo:
     (table,) = children
     return SolveInfo(table, is_selection, lost)
 

@@ -7,11 +7,13 @@ the tensors that the text names.
 
 from __future__ import annotations
 
+import itertools
 import json
+import weakref
 from typing import Any
 
 import torch
-from torch import Tensor
+from torch import Tensor, nn
 from torch.utils._python_dispatch import _disable_current_modes
 
 from .checks import reference, window
@@ -21,7 +23,18 @@ from .saving import layer_to_tree
 from .solution import DPCSolution, SolveInfo, lost
 from .solve.recovery import Thunks
 
+#: The layers of this process; compiled models find them by their handles.
+layers_by_handle: weakref.WeakValueDictionary[int, nn.Module] = weakref.WeakValueDictionary()
+_handles = itertools.count()
+
 WHY_NOT = "in a compiled or exported model it is not computed; call the layer outside of it"
+
+
+def register(layer: nn.Module) -> int:
+    """Return a new handle of a layer."""
+    handle = next(_handles)
+    layers_by_handle[handle] = layer
+    return handle
 
 
 def flat_parameters(
@@ -55,7 +68,7 @@ def planned_by_operator(
 ) -> DPCSolution:
     """Return the plan of one call of the operator; the arguments are those of `torch_dpc.operators.plan`."""
     u, y, lam, _, info, _, _ = torch.ops.torch_dpc.plan(theta, tensors, handle, text, on_failure, sizes)
-    return DPCSolution(u.to(dtype), y.to(dtype), SolveInfo(info, False, lost), lam, Thunks({}, WHY_NOT))
+    return DPCSolution(u.to(dtype), y.to(dtype), SolveInfo(info, None, lost), lam, Thunks({}, WHY_NOT))
 
 
 def batches_of(data: HankelData | HankelBatch, weights: tuple[Any, ...]) -> list[torch.Size]:
