@@ -128,25 +128,6 @@ class ConfiguredModule(nn.Module):
             theta = torch.cat([part.flatten(-2) for part in with_one_batch(parts)], dim=-1)
         return (theta if theta.dtype == torch.float64 else theta.double()), dtype
 
-    def config(self) -> dict[str, Any]:
-        """Return the arguments of the constructor beyond the data, as they are now."""
-        return {
-            "Q": self.Q,
-            "R": self.R,
-            "lambda_g": self.lambda_g,
-            "lambda_s": self.lambda_s,
-            "u_set": self.u_set,
-            "y_set": self.y_set,
-            "du_set": self.du_set,
-            "R_du": self.R_du,
-            "lambda_u": self.lambda_u,
-            "regularizer": self.regularizer,
-            "terminal_steps": self.terminal_steps,
-            "backward": self.backward_system,
-            "solver": self.solver,
-            "on_failure": self.on_failure,
-        }
-
     def get_extra_state(self) -> Tensor:
         """Return what `state_dict` holds besides parameters: compact data, settings and sets, as bytes."""
         return state_of(self)

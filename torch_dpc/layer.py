@@ -209,6 +209,25 @@ class DPCLayer(ConfiguredModule):
             raise ValueError("`compact_form` has no rows for changes of the input; leave out `du_set`.")
         return compact_form(self.data, weights, theta, self.terms)
 
+    def config(self) -> dict[str, Any]:
+        """Return the arguments of the constructor beyond the data, as they are now."""
+        return {
+            "Q": self.Q,
+            "R": self.R,
+            "lambda_g": self.lambda_g,
+            "lambda_s": self.lambda_s,
+            "u_set": self.u_set,
+            "y_set": self.y_set,
+            "du_set": self.du_set,
+            "R_du": self.R_du,
+            "lambda_u": self.lambda_u,
+            "regularizer": self.regularizer,
+            "terminal_steps": self.terminal_steps,
+            "backward": self.backward_system,
+            "solver": self.solver,
+            "on_failure": self.on_failure,
+        }
+
     def save(self, path: str | os.PathLike[str], *, data: bool = False) -> None:
         """Write the layer to a safetensors file: weights, sets, settings and the data, without pickle.
 
