@@ -25,8 +25,8 @@ class SolveInfo:
     """How the solve of each sample went; every tensor has the batch's shape.
 
     Attributes:
-        is_selection: the cost does not fix g; u, y and g are those of the minimum-norm g. None in a compiled model, which
-            does not tell.
+        is_selection: the cost does not fix g; u, y and g are those of the minimum-norm g. None in a compiled model,
+            which does not tell.
     """
 
     def __init__(self, table: Tensor, is_selection: bool | None, make_nonsingular: Callable[[], Tensor]):
