@@ -79,7 +79,7 @@ def test_algorithm_1_earns_more_than_noise_and_nothing():
     source = np.random.default_rng(0)
 
     def algorithm_1(env):
-        u_ini, y_ini, refs = env._window()
+        u_ini, y_ini, refs = env.window()
         p = attack(u_ini, y_ini, **refs)
         return (p / (0.1 * y_ini.norm())).reshape(-1).numpy()  # the reach of a ball is its radius
 
@@ -104,7 +104,7 @@ BUDGETS = {
 def test_actions_stay_in_the_budget_and_reach_all_of_it(name):
     budget, env = BUDGETS[name], make_env(BUDGETS[name])
     env.reset(seed=1)
-    _, y_ini, _ = env._window()
+    _, y_ini, _ = env.window()
     for seed in range(5):
         p = env.perturbation(np.random.default_rng(seed).uniform(-1, 1, 12), y_ini)
         assert float(budget.excess(p, y_ini)) <= 1e-9

@@ -225,10 +225,11 @@ def test_perturbations_of_a_run(runs):
 
 
 def test_a_worst_case():
-    result = types.SimpleNamespace(p=randn(3, 2), value=torch.tensor(1.5), bound=torch.tensor(1.25), gap=0.2)
+    figures = {"value": torch.tensor(1.5), "bound": torch.tensor(1.25), "gap": torch.tensor(0.2), "nominal": 2.0}
+    result = types.SimpleNamespace(p=randn(3, 2), **figures)
     entries, proof = plot.worst_case(result).axes
     np.testing.assert_array_equal(line(entries, "y1").get_ydata(), result.p[:, 1])
-    assert [text.get_text() for text in proof.texts] == ["found 1.5", "bound 1.25"]
+    assert [text.get_text() for text in proof.texts] == ["no attack 2", "found 1.5", "bound 1.25"]
     assert proof.get_title() == "gap 2.0e-01"
 
 

@@ -222,6 +222,28 @@ def test_batches_of_one_and_none_keep_their_shape():
     assert twin.crashed.shape == ()
 
 
+@pytest.mark.slow
+def test_a_thousand_vehicles_fly_500_steps_with_planning_in_a_minute_of_processor_time():
+    import time
+
+    import torch_dpc as dpc
+
+    twin = TorchQuadrotor()
+    pull = {"feedback": lambda y: -0.3 * (y[:3] - torch.tensor([0.0, 0.0, 1.0])), "amplitude": 0.5, "hold": 10}
+    u, y = dpc.collect(twin, 530, generator=generator(), **pull)
+    data = dpc.HankelData.from_trajectories(u, y, t_ini=6, horizon=25)
+    Q = torch.diag(torch.tensor([10.0, 10.0, 10.0, 0.0, 0.0, 0.0]))
+    layer = dpc.DPCLayer(data, Q, R=1.0, lambda_g=100.0, lambda_s=1e6, u_set=dpc.Box(-1.0, 1.0))
+    angle = 2 * math.pi * (torch.rand(1000, 1, generator=generator()) + torch.arange(525) / 250)
+    y_ref = torch.stack([0.3 * angle.cos(), 0.3 * angle.sin(), torch.ones_like(angle), *[0 * angle] * 3], dim=-1)
+    begin = time.process_time()
+    with torch.no_grad():
+        log = dpc.simulate(twin, dpc.DPCController(layer), y_ref, steps=500, reset={"position": y_ref[:, 0, :3]})
+    assert time.process_time() - begin < 60
+    assert not twin.crashed.any()
+    assert (log.y - log.y_ref)[:, 100:, :3].norm(dim=-1).mean() < 0.05
+
+
 def test_the_state_can_be_kept_and_put_back():
     twin = TorchQuadrotor()
     u = commands(1, 0.5, 5)

@@ -143,14 +143,14 @@ class AttackEnv(gymnasium.Env[Array, Array]):
             ValueError: an action of another shape, or not finite.
             SolveError: from a controller with `on_failure="raise"`.
         """
-        u_ini, y_ini, refs = self._window()
+        u_ini, y_ini, refs = self.window()
         p = self.perturbation(action, y_ini)
         count = min(self.controller.replan_every, self.steps - self._step)
         with torch.no_grad():
             psi = costs.bound(self.cost, self._step, u_ini, y_ini, **refs)
             cost = float(psi(self.controller.layer(u_ini, y_ini + p, **refs, on_failure="nan")))
             for _ in range(count):
-                u_ini, y_ini, refs = self._window()
+                u_ini, y_ini, refs = self.window()
                 self._apply(self.controller.step(u_ini, y_ini + p, **refs))
                 self._step += 1
         during = {"u": torch.stack(self._us[-count:]).numpy(), "y": torch.stack(self._ys[-count - 1 : -1]).numpy()}
@@ -171,14 +171,14 @@ class AttackEnv(gymnasium.Env[Array, Array]):
         self._us.append(u)
         self._ys.append(self._port.step(u))
 
-    def _window(self) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
-        """Return the inputs and outputs of the last t_ini steps, without the present output, and the references."""
+    def window(self) -> tuple[Tensor, Tensor, dict[str, Tensor]]:
+        """Return u_ini, y_ini and the references of the next plan: what an attack is called with."""
         u_ini, y_ini = torch.stack(self._us[-self._t_ini :]), torch.stack(self._ys[-self._t_ini - 1 : -1])
         ahead = slice(self._step, self._step + self._horizon)
         return u_ini, y_ini, {"y_ref": self._y_refs[ahead], "u_ref": self._u_refs[ahead]}
 
     def _observation(self) -> Array:
-        u_ini, y_ini, refs = self._window()
+        u_ini, y_ini, refs = self.window()
         elapsed = torch.tensor([self._step / self.steps], dtype=torch.float64)
         parts = [u_ini, y_ini, refs["u_ref"], refs["y_ref"], elapsed]
         return np.asarray(torch.cat([part.detach().reshape(-1) for part in parts]).numpy())

@@ -111,10 +111,10 @@ def perturbation(log: Any, axes: Any = None) -> Figure:
 
 @styled
 def worst_case(result: Any, axes: Any = None) -> Figure:
-    """Draw a proven worst case: the perturbation, and the value that was found between it and its bound.
+    """Draw a proven worst case: the perturbation, and its cost between the bound and the cost without an attack.
 
     Args:
-        result: of :func:`torch_dpc.attacks.worst_case`: p, value, bound, gap and status of one window.
+        result: a :class:`torch_dpc.attacks.WorstCase` of one window.
         axes: two axes; by default a new figure.
 
     Returns:
@@ -133,11 +133,14 @@ def worst_case(result: Any, axes: Any = None) -> Figure:
     entries.axhline(0.0, color=GREY, linewidth=0.8)
     entries.set(xlabel="step of the window", ylabel="perturbation", title="p, the worst admissible")
     entries.legend(ncols=2, fontsize="small")
-    ends = (("found", float(value), BLUE), ("bound", float(bound), VERMILION))
-    proof.plot([0, 0], [end for _, end, _ in ends], color=GREY, linewidth=1.0)
+    ends = [("no attack", float(result.nominal), GREY)]
+    ends += [("found", float(value), BLUE), ("bound", float(bound), VERMILION)]
+    if float(value) == float(bound):  # one mark for both
+        ends = [ends[0], ("found = bound", float(value), BLUE)]
+    proof.plot([0] * len(ends), [end for _, end, _ in ends], color=GREY, linewidth=1.0)
     for name, end, colour in ends:
         proof.plot([0], [end], "o", color=colour)
         proof.annotate(f"{name} {end:.5g}", (0, end), (8, 0), textcoords="offset points", va="center", color=colour)
-    proof.set(xlim=(-0.5, 2), xticks=[], ylabel=r"cost $\psi$", title=f"gap {float(as_array(result.gap)):.1e}")
+    proof.set(xlim=(-0.5, 2.5), xticks=[], ylabel=r"cost $\psi$", title=f"gap {float(as_array(result.gap)):.1e}")
     proof.margins(y=0.3)
     return figure

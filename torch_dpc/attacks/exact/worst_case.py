@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from ... import plot
 from ...checks import as_data
 from ...errors import Status
 from ...layer import DPCLayer
@@ -22,6 +23,9 @@ from .complementarity import Array, Budgeted, Rows, in_few_variables
 from .relaxation import Quadratic
 from .search import Search, search
 from .tighten import others_that_reach, tighten
+
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
 
 
 @dataclass(frozen=True)
@@ -63,6 +67,10 @@ class WorstCase:
     nominal: Tensor
     nodes: Tensor
     seconds: Tensor
+
+    def plot(self, axes: Any = None) -> Figure:
+        """Draw p, and its cost between the bound and that without an attack: :func:`torch_dpc.plot.worst_case`."""
+        return plot.worst_case(self, axes)
 
     def __repr__(self) -> str:
         if self.value.ndim == 0:
