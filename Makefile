@@ -12,7 +12,7 @@ ENV := .venv/.complete
 ARGS ?=
 
 .DEFAULT_GOAL := help
-.PHONY: help reproduce test bench fuzz docs lint package sanitize clean distclean
+.PHONY: help reproduce test bench fuzz mutants audit oldest docs lint package sanitize clean distclean
 
 help:  ## list the targets
 	@sed -n 's/^\([a-z]*\):.*## /  make \1\t/p' $(MAKEFILE_LIST) | expand -t 20
@@ -26,15 +26,35 @@ reproduce: $(ENV)  ## the paper's figures and tables, into results/
 	$(PY) -m scripts.table1_sizes
 	$(PY) -m scripts.report
 
+# The numerical tests run a second time without the kernels: the path of a GPU, and of a machine without a compiler.
+NUMERICAL := tests/solve/test_gradients.py tests/solve/test_engines.py tests/solve/test_optimality.py \
+	tests/sets/test_convex_sets.py tests/problem
 test: $(ENV)  ## every test and docstring example (ARGS="-m 'not slow'" for the quick ones)
 	@ignore=; $(PY) -c 'import pybullet' 2>/dev/null || ignore=--ignore=torch_dpc/systems/quadrotor.py; \
-	set -x; $(PY) -m pytest -n auto --dist worksteal tests --doctest-modules torch_dpc baselines $$ignore $(ARGS)
+	set -x; $(PY) -m pytest -n auto --dist worksteal tests --doctest-modules torch_dpc baselines $$ignore $(ARGS) && \
+	TORCH_DPC_NO_KERNELS=1 $(PY) -m pytest -q -n auto -m "not slow" $(NUMERICAL) $(ARGS)
 
 bench: $(ENV)  ## time and error of the layer (ARGS=--quick for a short run)
 	$(PY) -m scripts.benchmark $(ARGS)
 
 fuzz: $(ENV)  ## 10,000 random problems against an independent reference (ARGS="-n 100"; resumes where it was stopped)
 	$(PY) -m tests.fuzz $(ARGS)
+
+mutants: $(ENV)  ## wrong changes of the core, each of which a test must notice (resumes; about 20 minutes)
+	$(PY) -m tests.mutants $(ARGS)
+
+audit: $(ENV)  ## known vulnerabilities of the exact versions in constraints.txt (asks PyPI)
+	@$(PY) -m pip_audit --version >/dev/null 2>&1 || $(PIP) pip-audit
+	$(PY) -m pip_audit --strict --no-deps --disable-pip -r constraints.txt
+
+# An environment of its own, with the lower bounds of setup.cfg as exact versions; pytest and hypothesis as they come.
+oldest: $(ENV)  ## the tests of the core with the oldest versions that setup.cfg admits (torch may bring CUDA: 3 GB)
+	@test -x .venv-oldest/bin/python || $(PYTHON) -m venv .venv-oldest
+	$(PY) tests/oldest.py save > .venv-oldest/constraints.txt
+	.venv-oldest/bin/python -m pip --disable-pip-version-check -q install setuptools pytest pytest-xdist hypothesis clarabel \
+	-c .venv-oldest/constraints.txt $$(sed 's/==.*//' .venv-oldest/constraints.txt)
+	PYTHONPATH=$$PWD .venv-oldest/bin/python -m pytest -q -n auto -p no:cacheprovider -m "not slow" tests/test_layer.py \
+	tests/test_saving.py tests/sets tests/solve tests/problem tests/data tests/control tests/attacks tests/tuning $(ARGS)
 
 docs: .venv/.complete-docs  ## the documentation, into site/
 	$(PY) -m sphinx -q -W --keep-going docs site

@@ -1,0 +1,1 @@
+"""Mutants of the core: small wrong changes, each of which a test must notice (`make mutants`)."""

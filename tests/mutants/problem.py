@@ -1,0 +1,85 @@
+"""Mutants of the problem: weights, references, terms, reduction, the paper's form."""
+
+from .mutant import Mutant as M
+
+RED, ROWS = "torch_dpc/problem/reduction.py", "torch_dpc/problem/rows.py"
+OPT, TERMS, REDUCTION = "solve/test_optimality.py", "problem/test_terms.py", "problem/test_reduction.py"
+GRAD = "solve/test_gradients.py"
+
+MUTANTS = [
+    M("lambda_g without its 2", RED, "root_g = (2 * weights.lambda_g).sqrt()", "root_g = weights.lambda_g.sqrt()", OPT),
+    M(
+        "lambda_s without its 2",
+        RED,
+        "root = (2 * getattr(weights, fit.weight)).sqrt()",
+        "root = getattr(weights, fit.weight).sqrt()",
+        OPT,
+    ),
+    M(
+        "references of u and y swapped ends",
+        ROWS,
+        'Tracking("Q", slice(len(Uf), n_v), y_ref)',
+        'Tracking("Q", slice(len(Uf), n_v), None)',
+        OPT,
+    ),
+    M("u_ref ignored", ROWS, 'Tracking("R", slice(0, len(Uf)), u_ref)', 'Tracking("R", slice(0, len(Uf)), None)', OPT),
+    M(
+        "M charges one direction too few",
+        ROWS,
+        ">= (0 if terms.identity else space.rank_W)",
+        "> (0 if terms.identity else space.rank_W)",
+        OPT + " " + REDUCTION,
+    ),
+    M("identity charged like the projection", ROWS, "(0 if terms.identity else space.rank_W)", "space.rank_W", TERMS),
+    M(
+        "the change of u counts from zero",
+        ROWS,
+        "Uf - torch.cat([Up, Uf])[len(Up) - data.n_u : -data.n_u]",
+        "Uf - torch.cat([0 * Up, Uf])[len(Up) - data.n_u : -data.n_u]",
+        TERMS,
+    ),
+    M("terminal outputs are the first ones", ROWS, "equal.append(Yf[-last:])", "equal.append(Yf[:last])", TERMS),
+    M(
+        "terminal reference is the first one",
+        ROWS,
+        "places.append(torch.arange(n_theta - last, n_theta))",
+        "places.append(torch.arange(y_ref, y_ref + last))",
+        TERMS,
+    ),
+    M(
+        "what the data cannot produce is let through",
+        ROWS,
+        "return norm(missed, dim=-1) > REACHABLE",
+        "return norm(missed, dim=-1) > 1e9 + REACHABLE",
+        "solve/test_failures.py",
+    ),
+    M(
+        "the particular solution forgotten",
+        RED,
+        "A_theta[..., :, rows.Eq_theta] += rows.Eq_pinv",
+        "A_theta[..., :, rows.Eq_theta] += 0 * rows.Eq_pinv",
+        OPT,
+    ),
+    M(
+        "multipliers act with the wrong sign",
+        RED,
+        "return solution[..., : rows.n_theta], -solution[..., rows.n_theta :]",
+        "return solution[..., : rows.n_theta], solution[..., rows.n_theta :]",
+        REDUCTION,
+    ),
+    M("derivative through M is lost", RED, "return M - change - change.mT", "return M", REDUCTION),
+    M(
+        "derivative through M has the wrong sign",
+        RED,
+        "return M - change - change.mT",
+        "return M + change + change.mT",
+        REDUCTION,
+    ),
+    M(
+        "the weight's derivative at half",
+        RED,
+        "Psi = 2 * weights.lambda_g[..., None, None]",
+        "Psi = weights.lambda_g[..., None, None]",
+        REDUCTION,
+    ),
+]
