@@ -1,4 +1,4 @@
-"""Time against gradient error, one labelled point a configuration."""
+"""Time against gradient error, one numbered point a configuration, with a key."""
 
 from __future__ import annotations
 
@@ -25,9 +25,9 @@ MARK = 7.0  # half the size of what a point takes [points]
 
 
 def scatter(path: Path, lines: list[dict[str, str]], missing: list[str]) -> None:
-    """Draw the lines, which have a time and a gradient error, and name the configurations that have none."""
+    """Draw the lines, which have a time and a gradient error, numbered, and name the configurations that have none."""
     style()
-    figure, axes = plt.subplots(figsize=(9.6, 6.4))
+    figure, (axes, key) = plt.subplots(1, 2, figsize=(11.0, 6.4), width_ratios=(2.6, 1))
     points: list[tuple[float, float, str, str]] = []
     for group, (marker, colour, size) in GROUPS.items():
         chosen = [line for line in lines if _group(line["name"]) == group]
@@ -39,17 +39,28 @@ def scatter(path: Path, lines: list[dict[str, str]], missing: list[str]) -> None
     axes.set(xscale="log", yscale="log", xlabel="forward + backward, one problem [ms]")
     axes.set_ylabel("relative error of the gradient")
     axes.set_title("Oscillating masses, horizon 25: time and gradient error (lower left is better)")
-    axes.margins(x=0.17, y=0.14)
-    axes.set_xlim(right=10 * max(point[0] for point in points))  # names are longest on the right
+    axes.margins(x=0.08, y=0.08)
+    points.sort()
+    _write_key(key, points)
     figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=3)
     if missing:
         note = textwrap.fill("Without a gradient in time: " + ", ".join(missing) + ".", 150)
         figure.supxlabel(note, fontsize=7.5, color="#444444")
     figure.canvas.draw()
     figure.set_layout_engine("none")  # labels are placed in pixels: nothing may move any more
-    label(figure, axes, points)
+    label(figure, axes, [(x, y, str(i + 1), colour) for i, (x, y, _, colour) in enumerate(points)])
     figure.savefig(path)
     plt.close(figure)
+
+
+def _write_key(axes: Any, points: list[tuple[float, float, str, str]]) -> None:
+    """Write the name of every numbered point, the fastest first, in the colour of its group."""
+    axes.axis("off")
+    step = 1 / (len(points) + 1)
+    for i, (_, _, name, colour) in enumerate(points):
+        place = 1 - (i + 0.5) * step
+        axes.text(0.06, place, str(i + 1), ha="right", va="center", fontsize=9, weight="bold", color=colour)
+        axes.text(0.10, place, name, va="center", fontsize=9)
 
 
 def label(figure: Any, axes: Any, points: list[tuple[float, float, str, str]]) -> None:
