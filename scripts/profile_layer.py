@@ -27,8 +27,6 @@ from scripts.bench.cases import CYCLE, N_G, T_INI, inputs_of, layer_of, record, 
 from scripts.shared.command import RESULTS, cores, versions
 from torch_dpc.sets.bounds import Bounds
 from torch_dpc.solve import kernels
-from torch_dpc.solve.active_set import adjoint
-from torch_dpc.solve.newton import solve_newton
 
 PLANT, HORIZON, BATCHES = "masses", 25, (1, 1024)
 BUDGET, LEAST, MOST = 6.0, 7, 2000  # [s] and rounds of each batch size; a round runs every stage once
@@ -72,48 +70,29 @@ def stages_of(layer: dpc.DPCLayer, problems: list[Problem]) -> tuple[Stages, Sta
     """Return the stages around the solve, inside it, and of the backward; and the whole solve among the first."""
     device = torch.device("cpu")
     solver = layer.factored(device).solver
-    reduction, (lower, upper) = solver.reduction, layer.bounds(device)
-    sets = Bounds(lower, upper)
+    planner, sets = solver.compiled, Bounds(*layer.bounds(device))
+    assert planner is not None
     thetas = [_theta(layer, problem) for problem in problems]
-    solved = [solver.solve(theta, sets, "raise") for theta in thetas]
-    one = thetas[0].ndim == 1  # one problem: NumPy around the kernel; many: torch
-    in_units, unit = solver.in_units, solver.unit  # what is inside the solve
-    optimality, as_array = in_units.optimality, (Tensor.numpy if one else lambda tensor: tensor)
-    if one:
-        assert solver.single is not None
-        optimality = solver.single.optimality
-    lower, upper = lower / unit, upper / unit
-    samples, lo, up = [as_array(theta) for theta in thetas], as_array(lower), as_array(upper)
-    starts: list[Any] = [optimality.unconstrained(sample) for sample in samples]
-    lams = [as_array(found.lam * unit) for found in solved]
-    G = in_units.reduction.G.contiguous().numpy()
-
-    def judge(i: int) -> Any:
-        raw, error = optimality.displaced(starts[i], lams[i]), optimality.error(samples[i], lams[i])
-        return optimality.judge(raw, lams[i], lo, up, error)
-
-    def find(start: Any) -> Any:
-        if one:
-            return kernels.solve_boxes(G, start[None], lo, up)
-        return solve_newton(in_units.reduction.G, in_units.reduction.Ct, start, lower, upper)
-
-    bars, N = [torch.ones_like(found.lam) for found in solved], len(lower)
-    flat = [(f.active.reshape(-1, N), bar.reshape(-1, N), None) for f, bar in zip(solved, bars, strict=True)]
-    A, C, n = reduction.A_theta, reduction.rows.C, len(problems)
+    arrays = planner.arrays(sets, thetas[0].shape[:-1], device)
+    assert arrays is not None
+    flat, V, n = [theta.reshape(-1, theta.shape[-1]) for theta in thetas], planner.reduction.V, len(problems)
+    starts = [None if len(theta) == 1 else (theta @ V.mT).numpy() for theta in flat]  # the kernel's own for one
+    planned = [solver.solve(theta, sets, "raise") for theta in thetas]
+    at = [(p.lam, p.lam, p.active, p.active) for p in planned]
+    bars, threads = [np.ones(p.lam.shape) for p in planned], torch.get_num_threads()
     around = {
         "checks and flattening": lambda i: _theta(layer, problems[i % n]),
         "weights and bounds unchanged?": lambda i: (layer.factored(device), layer.bounds(device)),
         "the whole solve": lambda i: solver.solve(thetas[i % n], sets, "raise"),
     }
-    inside = {
-        "unconstrained minimiser": lambda i: optimality.unconstrained(samples[i % n]),
-        "finding the active set": lambda i: find(starts[i % n]),
-        "judging the solution": lambda i: judge(i % n),
+    inside: Stages = {
+        "kernel: multipliers, plan, judgement": lambda i: kernels.plan(
+            planner.map, arrays, flat[i % n].numpy(), starts[i % n], threads
+        ),
     }
-    backward = {
-        "systems on the active rows": lambda i: adjoint(reduction.G, reduction.Ct, *flat[i % n]),
-        "products with C' and A'": lambda i: (bars[i % n] @ C) @ A,
-    }
+    if starts[0] is not None:
+        inside = {"V theta": lambda i: flat[i % n] @ V.mT, **inside}
+    backward = {"kernel: adjoint, and V'": lambda i: planner.adjoint(sets, at[i % n], bars[i % n], None)}
     return around, inside, backward
 
 

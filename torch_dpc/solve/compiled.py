@@ -45,7 +45,8 @@ class CompiledPlanner:
         return CompiledPlanner(in_units, unit) if simple and kernels.serve(in_units.G) else None
 
     @cached_property
-    def _map(self) -> kernels.Map:
+    def map(self) -> kernels.Map:
+        """The problem as the kernel reads it."""
         reduction = self.reduction
         of_theta, of_lam = reduction.error.amax(-2).tolist()
         diagonal = reduction.G.diagonal()
@@ -55,7 +56,7 @@ class CompiledPlanner:
 
     @cached_property
     def _per_unit(self) -> np.ndarray:
-        return 1 / self._map.unit
+        return 1 / self.map.unit
 
     def solve(self, theta: Tensor, sets: Sets) -> kernels.PlannedArrays | None:
         """Return the plans, in the caller's units, with the batch dimensions of theta; `convinces` stays `(B,)`.
@@ -68,12 +69,12 @@ class CompiledPlanner:
             None if the kernel does not know the sets, or their batch dimensions are not those of theta.
         """
         batch = theta.shape[:-1]
-        arrays = self._arrays(sets, batch, theta.device)
+        arrays = self.arrays(sets, batch, theta.device)
         if arrays is None:
             return None
         flat = kernels.as_array(theta).reshape(-1, theta.shape[-1])
         v0 = None if len(flat) <= FEW else (theta.reshape(flat.shape) @ self.reduction.V.mT).numpy()
-        found = kernels.plan(self._map, arrays, flat, v0, torch.get_num_threads())
+        found = kernels.plan(self.map, arrays, flat, v0, torch.get_num_threads())
         if len(batch) == 1:
             return found
         v, lam, active, weak, info = (x.reshape(*batch, x.shape[-1]) for x in found[:5])
@@ -94,13 +95,13 @@ class CompiledPlanner:
             None if the kernel does not know the sets, or the held directions of a sample are dependent.
         """
         batch, n = v_bar.shape[:-1], v_bar.shape[-1]
-        arrays = self._arrays(sets, torch.Size(batch), self.unit.device)
+        arrays = self.arrays(sets, torch.Size(batch), self.unit.device)
         if arrays is None:
             return None
         v, lam, active, weak = (kernels.as_array(x).reshape(-1, n) for x in at)
         bars = v_bar.reshape(-1, n), None if lam_bar is None else kernels.as_array(lam_bar).reshape(-1, n)
         few, threads = len(lam) <= FEW, torch.get_num_threads()
-        found = kernels.plan_adjoint(self._map, arrays, (v, lam, active, weak), *bars, of_theta=few, threads=threads)
+        found = kernels.plan_adjoint(self.map, arrays, (v, lam, active, weak), *bars, of_theta=few, threads=threads)
         if found is None:
             return None
         v0_bar, theta_bar = found
@@ -108,7 +109,7 @@ class CompiledPlanner:
             theta_bar = ((torch.from_numpy(v0_bar) * self.unit) @ self.reduction.V).numpy()
         return torch.from_numpy(theta_bar.reshape(*batch, theta_bar.shape[-1]))
 
-    def _arrays(self, sets: Sets, batch: torch.Size, device: torch.device) -> kernels.SetArrays | None:
+    def arrays(self, sets: Sets, batch: torch.Size, device: torch.device) -> kernels.SetArrays | None:
         """Return the sets in units as the kernel reads them; None if it does not know them, or another batch."""
         if not kernels.serve(self.unit):
             return None
