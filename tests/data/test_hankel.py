@@ -101,7 +101,7 @@ def test_rank_of_single_precision_recordings_ignores_their_rounding():
     assert data.rank == 4 + 2 * 14
 
 
-@pytest.mark.parametrize("noise", [0.0, 1e-2])
+@pytest.mark.parametrize("noise", [0.0, 1e-8, 1e-2])
 def test_the_basis_is_orthonormal_and_holds_every_row(noise):
     data = masses_data(noise)
     B = data.row_space.basis

@@ -15,11 +15,9 @@ from tests.oracles.problem import Sample
 from tests.oracles.reduction import rows_of
 
 SHORT = 25
-FAILED = pytest.mark.xfail(reason="cones that touch at once: marked FAILED though a plan exists")
-OPEN = {10: FAILED}  # cases of the short run that are known to fail
 
 
-@pytest.mark.parametrize("index", [pytest.param(i, marks=OPEN.get(i, ())) for i in range(SHORT)])
+@pytest.mark.parametrize("index", range(SHORT))
 def test_sensible_problems_are_solved_or_rightly_marked(index):
     report = run("sensible", index)
     assert not report.error, report

@@ -3,7 +3,6 @@
 from dataclasses import replace
 
 import numpy as np
-import pytest
 import torch
 from hypothesis import Phase, assume, given, settings
 from hypothesis import strategies as st
@@ -91,7 +90,6 @@ def test_a_plan_follows_the_order_of_its_channels(case, random):
     assert_plans_agree(ours, theirs, case, ROUNDING)
 
 
-@pytest.mark.xfail(reason="ranks and acceptance mix units")
 @FEW
 @given(CASES, st.lists(UNITS, min_size=4, max_size=4), UNITS)
 def test_units_do_not_matter(case, unit_u, unit_y):
