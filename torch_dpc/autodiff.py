@@ -52,8 +52,8 @@ def refuse_forward_twice() -> None:
 def apply_function(function: type[torch.autograd.Function], *args: Any) -> Any:
     """Return `function.apply(*args)`.
 
-    `Function.apply` binds the arguments by name and looks for wrappers that transforms left behind, which takes longer
-    than the rest of a small Function. Where no transform is at work and nothing is wrapped, what it then calls will do.
+    `Function.apply` binds the arguments by name and looks for wrappers left by ended transforms, which takes longer
+    than the rest of a small Function. If no transform is active and no argument is wrapped, this calls its base.
     """
     if are_transforms_active() or not all(is_plain(arg) for arg in args if isinstance(arg, Tensor)):
         return function.apply(*args)
@@ -63,15 +63,15 @@ def apply_function(function: type[torch.autograd.Function], *args: Any) -> Any:
 def is_grads_batched(tensor: Tensor) -> bool:
     """Return whether a cotangent is one of many at once, from `torch.autograd.grad(..., is_grads_batched=True)`.
 
-    That is an older `vmap`, which does not look for the rules of a Function: its tensors stand plain operations alone.
+    That is the older `vmap`, which ignores the `vmap` rule of a Function: its tensors support built-in operations only.
     """
     return _is_legacy_batched(tensor)
 
 
 def untransformed() -> contextlib.AbstractContextManager[Any]:
-    """Return a context without transforms, for what outlives the call; there every tensor must be plain.
+    """Return a context without transforms, for results that outlive the call; every tensor in it must be plain.
 
-    Within one, even a new tensor is wrapped, and its wrapper is no good once the transform has ended.
+    Within a transform even a new tensor is wrapped, and its wrapper is invalid once the transform has ended.
     """
     return getattr(torch._C, "_DisableFuncTorch", contextlib.nullcontext)()
 

@@ -17,7 +17,7 @@ from torch import Tensor, nn
 Part = tuple["ConvexSet", Tensor]
 
 
-#: What a set has by definition of its projection, unless it says otherwise.
+#: Methods that have a default derived from the projection.
 _FOLLOWING = (
     "separable",
     "jacobian",
@@ -56,7 +56,7 @@ class ConvexSet(nn.Module):
     separable = False
 
     def __init_subclass__(cls, **options: Any) -> None:
-        """Have what follows from a projection follow from the subclass's own, not from that of the class above it."""
+        """Reset the derived methods to their defaults if the subclass defines a projection of its own."""
         super().__init_subclass__(**options)
         if "project" in vars(cls) or "prox" in vars(cls):
             for name in _FOLLOWING:

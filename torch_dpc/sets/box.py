@@ -74,7 +74,7 @@ class Box(ConvexSet):
         return (lower == upper).expand_as(x)
 
     def check_values(self) -> None:
-        """Raise ValueError unless lower <= upper with a finite point between; the solve tells of what `vmap` maps."""
+        """Raise ValueError unless lower <= upper with a finite point between; the solve checks vmapped bounds."""
         check_order(as_tensor(self.lower), as_tensor(self.upper))
 
     def project(self, x: Tensor) -> Tensor:

@@ -35,7 +35,7 @@ def as_tensor(bound: Tensor | float) -> Tensor:
 
 
 def check_order(lower: Tensor, upper: Tensor) -> None:
-    """Raise ValueError unless lower <= upper and a finite point lies between; what `vmap` maps cannot be looked at."""
+    """Raise ValueError unless lower <= upper and a finite point lies between; bounds under `vmap` are not checked."""
     try:
         torch.broadcast_shapes(lower.shape, upper.shape)
     except RuntimeError as error:

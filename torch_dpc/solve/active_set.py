@@ -1,9 +1,10 @@
 """Small symmetric systems on the active rows, one set of rows a sample.
 
-A sample with active rows A needs  lam_A = G[A, A]^-1 rhs_A,  lam = 0 elsewhere: Newton's step in the forward solve,
-the adjoint in the backward one. On the CPU the compiled kernels take the samples; elsewhere their rows are packed to
-the longest list and the missing ones read an identity, so that one batched Cholesky serves. Samples whose active rows
-are (nearly) dependent go through a QR of the rows of Ct, because G = Ct Ct' squares their condition.
+For the active rows A of a sample solve  lam_A = G[A, A]^-1 rhs_A,  lam = 0 elsewhere. This is Newton's step in the
+forward solve and the adjoint in the backward one. On the CPU the compiled kernels do it. Elsewhere the samples'
+systems are padded with an identity to the size of the largest one, for one batched Cholesky factorisation. If the
+active rows of a sample are (nearly) linearly dependent, a QR of the rows of Ct takes its place, because G = Ct Ct'
+squares their condition.
 """
 
 from __future__ import annotations
@@ -13,9 +14,9 @@ from torch import Tensor
 
 from ..batching import times
 from . import kernels
-from .kernels import STANDING_OUT
+from .kernels import STANDING_OUT as INDEPENDENCE_TOLERANCE
 
-#: Rows of Ct that stand out of the span of the others by less than this fraction of their length are dependent.
+#: A row of Ct whose part outside the span of the rows before it is below this fraction of its length is dependent.
 DEPENDENT_ROW = 1e-9
 
 
@@ -61,9 +62,9 @@ def _packed(G: Tensor, active: Tensor, rhs: Tensor) -> tuple[Tensor, Tensor]:
     lam = torch.zeros_like(rhs).masked_scatter(active, x[index < n])
     if L.shape[-1] == 0:
         return lam, info == 0
-    # What of a row stands out of the span of those before it, as a fraction of its length: free of units.
-    standing = L.diagonal(dim1=-2, dim2=-1) / block.diagonal(dim1=-2, dim2=-1).sqrt()
-    return lam, (info == 0) & (standing.amin(-1) > STANDING_OUT)
+    # The part of each row outside the span of the rows before it, as a fraction of its length.
+    independence = L.diagonal(dim1=-2, dim2=-1) / block.diagonal(dim1=-2, dim2=-1).sqrt()
+    return lam, (info == 0) & (independence.amin(-1) > INDEPENDENCE_TOLERANCE)
 
 
 def _identity_padded(G: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ PRIMAL_TOLERANCE = 1e-10
 #: DAQP's exit flag for an optimal solution.
 SOLVED_FLAG = 1
 _EQUALITY = np.int32(5)
-#: What DAQP reads as no bound.
+#: DAQP's infinity.
 _NO_BOUND = 1e30
 
 
@@ -67,7 +67,7 @@ class Daqp:
 
 
 def sense_of(tight: np.ndarray) -> np.ndarray:
-    """Return DAQP's kinds of constraints: equality where the bounds leave no choice."""
+    """Return DAQP's constraint types: equality where lower and upper bound are equal."""
     return tight * _EQUALITY
 
 

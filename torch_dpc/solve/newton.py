@@ -7,13 +7,15 @@ on them, rows whose multiplier has the wrong sign are let go, and
 
 (the primal-dual active set method; Hintermueller, Ito, Kunisch 2002). It ends, exactly, when the set repeats.
 
-On the CPU the compiled kernel takes the samples one by one, from a first set that a few sweeps of coordinate descent on
-the multipliers find. Elsewhere all samples step together in operations of torch, and the first set comes from a few
-accelerated gradient steps in single precision, which are matrix products alone and cost less than one Newton step.
-Either start is nearly right, so one or two steps finish.
+On the CPU the compiled kernel solves sample by sample, from a first active set that a few sweeps of coordinate descent
+on the multipliers find. Elsewhere torch steps all samples together. Their first set comes from a few accelerated
+gradient steps in single precision, which are matrix products and cost less than one Newton step. Either start is nearly
+the solution, so that one or two Newton steps finish.
 """
 
 from __future__ import annotations
+
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -23,12 +25,24 @@ from .active_set import solve_active
 from .kernels import HYSTERESIS
 from .outcome import Found
 
-#: Steps after which a sample is left to the second engine; converging samples need 2 to 7.
-MAX_STEPS = 20
-#: Rows within this fraction of the width of their bounds are worked on from the start.
-NEAR = 0.2
-#: Accelerated gradient steps before the first Newton step. On the masses, 15 leave 1.2 Newton steps a sample of 3.3.
-GRADIENT_STEPS = 15
+
+@dataclass(frozen=True)
+class PrimalDualSettings:
+    """Settings of the primal-dual active set method in torch.
+
+    Attributes:
+        steps: steps after which a sample is left to the second engine; samples that converge need 2 to 7.
+        near: rows within this fraction of the width of their bounds are in the system from the start.
+        warm_start_steps: accelerated gradient steps before the first Newton step. On the masses, 15 leave 1.2 Newton
+            steps a sample of 3.3.
+    """
+
+    steps: int = 20
+    near: float = 0.2
+    warm_start_steps: int = 15
+
+
+SETTINGS = PrimalDualSettings()
 
 
 def solve_newton(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> Found:
@@ -60,7 +74,7 @@ def _batched(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) ->
     )
     todo = torch.arange(len(v0), device=v0.device)
     # Most rows never meet a bound: iterate on those that some sample violates or comes near, then look at all rows.
-    near = torch.nan_to_num(NEAR * (upper - lower), posinf=0.0)
+    near = torch.nan_to_num(SETTINGS.near * (upper - lower), posinf=0.0)
     working = ((v0 > upper - near) | (v0 < lower + near) | (lower == upper)).any(dim=0)
     slack_upper, slack_lower = upper + HYSTERESIS * (1 + upper.abs()), lower - HYSTERESIS * (1 + lower.abs())
     while len(todo):
@@ -100,7 +114,7 @@ def _iterate(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) ->
     lam = _warm_start(G, v0, lower, upper)
     pushed = v0 - _times(lam, G) + lam
     active = (pushed > above) | (pushed < below)
-    for step in range(1, MAX_STEPS + 1):
+    for step in range(1, SETTINGS.steps + 1):
         low, high = _take_bound(lower, todo), _take_bound(upper, todo)
         G_todo, v0_todo = _take(G, todo), v0[todo]
         target = torch.clamp(pushed, low, high)
@@ -115,7 +129,7 @@ def _iterate(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) ->
         done, todo = left[~stay], left[stay]
         lam_out[done], steps[done], converged[done] = lam[~stay], step, independent[~stay]
         pushed, active = pushed[stay], again[stay]
-    steps[todo] = MAX_STEPS
+    steps[todo] = SETTINGS.steps
     return lam_out, steps, converged
 
 
@@ -126,7 +140,7 @@ def _warm_start(G: Tensor, v0: Tensor, lower: Tensor, upper: Tensor) -> Tensor:
     size = torch.where(size > 0, size, 1.0)[..., None]
     step = torch.eye(G.shape[-1], dtype=G.dtype, device=G.device) - G / size[..., None]
     lam = ahead = torch.zeros_like(v0)
-    for k in range(GRADIENT_STEPS):
+    for k in range(SETTINGS.warm_start_steps):
         pushed = torch.addmm(v0, ahead, step) if G.ndim == 2 else v0 + _times(ahead, step)
         new = pushed - torch.clamp(pushed, lower, upper)
         ahead = torch.lerp(lam, new, 1 + k / (k + 3))

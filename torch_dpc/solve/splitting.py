@@ -1,16 +1,16 @@
 """The forward solve for any convex set with a projection.
 
 A solution is a zero of  F(lam) = v - P(v + gamma lam),  v = v0 - G lam.  A few steps of Douglas-Rachford splitting
-(Lions and Mercier 1979) come near, and semismooth Newton on F finishes: its step is the projected system of
-:mod:`torch_dpc.solve.projected_system`. That is all for most problems. Where the rows that meet their bounds depend on
-each other Newton's system is singular, and the augmented Lagrangian of the least-distance form,
+(Lions and Mercier 1979) give a start, and semismooth Newton on F, whose step is the projected system of
+:mod:`torch_dpc.solve.projected_system`, solves most problems. Newton's system is singular if the rows that meet their
+bounds are linearly dependent. Such problems go to the augmented Lagrangian of the least-distance form,
 
     minimise 1/2 |x|^2   subject to   v = v0 + Ct x in the set,          x = -Ct' lam,
 
-takes over: each of its problems is smooth and strongly convex, so that Newton with a line search solves it from
-everywhere, and the multipliers converge for every convex set (Li, Sun, Toh 2018). Newton on F polishes the result.
+each of whose subproblems is smooth and strongly convex: Newton with a line search solves it from every start, and the
+multipliers converge for every convex set (Li, Sun, Toh 2018). Newton on F polishes the result.
 
-gamma is one number for each group of rows that a set constrains, the displacement that a unit of multiplier makes.
+gamma, one number for each group of rows that a set constrains, is the displacement that a unit of multiplier makes.
 """
 
 from __future__ import annotations
@@ -24,33 +24,77 @@ from ..batching import times
 from ..sets.feasible import FeasibleSet
 from .projected_system import newton_step
 
-#: Splitting steps before Newton.
-SPLITTING_STEPS = 20
-#: Newton's steps in one attempt, and how often a step is halved.
-NEWTON_STEPS, HALVINGS = 25, 12
-#: |F| relative to 1 + |v| at which a sample has converged.
-CONVERGED = 1e-13
-#: |F| at which the augmented Lagrangian has done its part, and rounds that it may go on without halving |F|.
-CLOSE, PATIENCE = 1e-11, 20
-#: |F| above which, relative to 1 + |v|, a sample is worth another way.
-GOOD = 1e-10
-#: Penalties of the augmented Lagrangian, in units of 1 / gamma: the first, the largest, the growth; and its rounds.
-PENALTY, LARGEST_PENALTY, GROWTH, ROUNDS = 1.0, 1e9, 10.0, 60
-#: Newton steps on one augmented Lagrangian, the slope at which it is solved, and bisections of a line search.
-INNER_STEPS, FLAT, BISECTIONS = 40, 1e-12, 40
-#: What rounding leaves of a slope at least, relative to its terms; near it (the second number is how near), steps that
-#: do not halve the slope any more (the third is how many) have found as much as there is.
-ROUNDING, FEW_ULPS, STALLED = 1e-16, 100.0, 3
-#: Newton steps up to which the penalty may grow.
-EASY = 20
+
+@dataclass(frozen=True)
+class NewtonSettings:
+    """Settings of Newton on F and of the splitting before it.
+
+    Attributes:
+        splitting_steps: Douglas-Rachford steps before Newton.
+        steps: Newton steps in one attempt.
+        halvings: how often a step is halved until |F| shrinks.
+        decrease: fraction of |F| by which a step of length 1 must shrink it.
+        converged: |F| relative to 1 + |v| at which a sample has converged.
+        good: |F| relative to 1 + |v| above which the augmented Lagrangian has its turn.
+        least_scale: gamma of a group, relative to the largest diagonal entry of G, at least.
+    """
+
+    splitting_steps: int = 20
+    steps: int = 25
+    halvings: int = 12
+    decrease: float = 1e-4
+    converged: float = 1e-13
+    good: float = 1e-10
+    least_scale: float = 1e-6
+
+
+@dataclass(frozen=True)
+class AugmentedLagrangianSettings:
+    """Settings of the augmented Lagrangian method; penalties are in units of 1 / gamma.
+
+    Attributes:
+        rounds: updates of the multipliers.
+        close: |F| relative to 1 + |v| at which Newton on F takes over.
+        patience: rounds without halving |F| after which a sample is given up.
+        penalty, largest_penalty, growth: the first penalty, the largest, and the factor from round to round.
+        easy_steps: Newton steps of a round up to which the penalty may grow.
+        inner_steps: Newton steps of one round.
+        flat: slope at which a round is solved, relative to the first slope and |x|.
+        slope_rounding: rounding of a slope, relative to its terms.
+        near_rounding: a slope within this factor of its rounding counts as solved once it has stalled.
+        stalled_steps: steps without halving the slope after which it has stalled.
+        bisections: bisections of a line search.
+        too_far, too_short: a step is too long (short) if the slope at its end exceeds this fraction of the slope at its
+            start, with the other sign (the same sign).
+    """
+
+    rounds: int = 60
+    close: float = 1e-11
+    patience: int = 20
+    penalty: float = 1.0
+    largest_penalty: float = 1e9
+    growth: float = 10.0
+    easy_steps: int = 20
+    inner_steps: int = 40
+    flat: float = 1e-12
+    slope_rounding: float = 1e-16
+    near_rounding: float = 100.0
+    stalled_steps: int = 3
+    bisections: int = 40
+    too_far: float = 0.1
+    too_short: float = 0.5
+
+
+NEWTON = NewtonSettings()
+LAGRANGIAN = AugmentedLagrangianSettings()
 
 
 @dataclass
 class Found:
     """Multipliers `(B, N)`, steps taken and |F| relative to 1 + |v|, each `(B,)`.
 
-    `gap` is the shortest way from the sets to the trajectories, `(B, N)`, as the augmented Lagrangian saw it last; it
-    does not vanish where there is no solution.
+    `gap`, `(B, N)`, is an estimate of the shortest vector from the sets to the trajectories, from the last round of the
+    augmented Lagrangian; it does not vanish if there is no solution.
     """
 
     lam: Tensor
@@ -86,8 +130,8 @@ def solve_convex(G: Tensor, Ct: Tensor, resolvent: Tensor, v0: Tensor, sets: Fea
     """
     lam = _split(resolvent, v0, sets, gamma)
     lam, iterations, residual = _newton(G, v0, sets, gamma, lam)
-    found = Found(lam, iterations + SPLITTING_STEPS, residual, torch.zeros_like(v0))
-    bad = residual > GOOD
+    found = Found(lam, iterations + NEWTON.splitting_steps, residual, torch.zeros_like(v0))
+    bad = residual > NEWTON.good
     if not bool(bad.any()):
         return found
     some = bad.nonzero()[:, 0] if v0.ndim == 2 and not sets.batch_shape else slice(None)
@@ -105,7 +149,7 @@ def solve_convex(G: Tensor, Ct: Tensor, resolvent: Tensor, v0: Tensor, sets: Fea
 def _split(resolvent: Tensor, v0: Tensor, sets: FeasibleSet, gamma: Tensor) -> Tensor:
     """Return multipliers after a few steps of Douglas-Rachford splitting."""
     state = v0
-    for _ in range(SPLITTING_STEPS):
+    for _ in range(NEWTON.splitting_steps):
         nearest = sets.prox(state, gamma)
         behind = 2 * nearest - state
         # The affine map's resolvent: (G + gamma) lam = v0 - behind, and v = behind + gamma lam.
@@ -126,17 +170,17 @@ def _newton(G: Tensor, v0: Tensor, sets: FeasibleSet, gamma: Tensor, lam: Tensor
     """Newton on F, steps halved until |F| shrinks; return multipliers, steps, and |F| relative to 1 + |v|."""
     F, x, size = _residual(G, v0, sets, gamma, lam)
     iterations = torch.zeros_like(size, dtype=torch.int64)
-    for _ in range(NEWTON_STEPS):
-        todo = size > CONVERGED
+    for _ in range(NEWTON.steps):
+        todo = size > NEWTON.converged
         if not bool(todo.any()):
             break
         step = newton_step(G, sets, sets.jacobians(x, gamma), F, gamma)
         iterations = iterations + todo
         length = todo.to(size)
-        for _ in range(HALVINGS):
+        for _ in range(NEWTON.halvings):
             trial = lam + length[..., None] * step
             F_trial, x_trial, size_trial = _residual(G, v0, sets, gamma, trial)
-            longer = todo & ~(size_trial < (1 - 1e-4 * length) * size)
+            longer = todo & ~(size_trial < (1 - NEWTON.decrease * length) * size)
             if not bool(longer.any()):
                 break
             length = torch.where(longer, length / 2, length)
@@ -158,8 +202,8 @@ def _augmented_lagrangian(
     may_leave = v0.ndim == 2 and not sets.batch_shape
     rest: Tensor | slice = torch.arange(len(v0), device=v0.device) if may_leave else slice(None)
     lam, x = torch.zeros_like(v0), v0.new_zeros(*v0.shape[:-1], Ct.shape[-1])
-    penalty, idle = torch.full_like(least, PENALTY)[..., None], torch.zeros_like(steps)
-    for _ in range(ROUNDS):
+    penalty, idle = torch.full_like(least, LAGRANGIAN.penalty)[..., None], torch.zeros_like(steps)
+    for _ in range(LAGRANGIAN.rounds):
         centre, C, H = v0[rest], *(m if m.ndim == 2 else m[rest] for m in (Ct, G))
         reach = gamma / penalty  # the gamma of this round: w - P(w), over it, is the new multiplier
         x, spent = _minimise(C, centre + reach * lam, sets, reach, x)
@@ -172,13 +216,13 @@ def _augmented_lagrangian(
         best[rest] = torch.where(better[..., None], lam, best[rest])
         idle = torch.where(size < 0.5 * least[rest], 0, idle + 1)
         least[rest] = torch.where(better, size, least[rest])
-        stay = (size > CLOSE) & (idle < PATIENCE)
+        stay = (size > LAGRANGIAN.close) & (idle < LAGRANGIAN.patience)
         if not bool(stay.any()):
             break
-        # A problem that took many steps is hard enough: multipliers that move closer make the next one easier.
-        grown = (GROWTH * penalty).clamp_max(LARGEST_PENALTY)
-        penalty = torch.where(spent[..., None] < EASY, grown, penalty)
-        penalty = torch.where(spent[..., None] == INNER_STEPS, penalty / GROWTH, penalty)
+        # The penalty does not grow after a round of many steps: better multipliers make the next one easier.
+        grown = (LAGRANGIAN.growth * penalty).clamp_max(LAGRANGIAN.largest_penalty)
+        penalty = torch.where(spent[..., None] < LAGRANGIAN.easy_steps, grown, penalty)
+        penalty = torch.where(spent[..., None] == LAGRANGIAN.inner_steps, penalty / LAGRANGIAN.growth, penalty)
         if may_leave:
             rest, lam, x, penalty, idle = rest[stay], lam[stay], x[stay], penalty[stay], idle[stay]  # type: ignore[index]
     return best, steps, gap
@@ -196,13 +240,13 @@ def _minimise(Ct: Tensor, shift: Tensor, sets: FeasibleSet, reach: Tensor, x: Te
     norm = torch.linalg.vector_norm
     may_leave = x.ndim == 2 and not sets.batch_shape
     size = left = norm(gradient, dim=-1)
-    rounding, stalled = ROUNDING * torch.linalg.matrix_norm(Ct), torch.zeros_like(steps)
-    for _ in range(INNER_STEPS):
-        floor = FLAT * (size + norm(x, dim=-1)) + rounding * norm(w / reach, dim=-1)
+    rounding, stalled = LAGRANGIAN.slope_rounding * torch.linalg.matrix_norm(Ct), torch.zeros_like(steps)
+    for _ in range(LAGRANGIAN.inner_steps):
+        floor = LAGRANGIAN.flat * (size + norm(x, dim=-1)) + rounding * norm(w / reach, dim=-1)
         now = norm(gradient, dim=-1)
         stalled = torch.where(now < 0.5 * left, 0, stalled + 1)
         left = torch.minimum(left, now)
-        todo = (now > floor) & ((stalled < STALLED) | (now > FEW_ULPS * floor))
+        todo = (now > floor) & ((stalled < LAGRANGIAN.stalled_steps) | (now > LAGRANGIAN.near_rounding * floor))
         if not bool(todo.any()):
             break
         some = todo.nonzero()[:, 0] if may_leave else slice(None)
@@ -211,14 +255,15 @@ def _minimise(Ct: Tensor, shift: Tensor, sets: FeasibleSet, reach: Tensor, x: Te
         step[some] = _newton_step(C, w[some], gradient[some], sets, scale)
         step = step * todo[..., None]
         steps = steps + todo
-        # The slope along the step grows from below zero: the minimum is where it vanishes, and 1 is tried first.
+        # The slope along the step increases from a negative value; the minimum is its zero. Length 1 is tried first.
         low, high = torch.zeros_like(steps, dtype=x.dtype), torch.ones_like(steps, dtype=x.dtype)
         start, length = (gradient * step).sum(-1), high
-        for _ in range(BISECTIONS):
+        for _ in range(LAGRANGIAN.bisections):
             trial = x + length[..., None] * step
             gradient_trial, w_trial = slope(trial)
             along = (gradient_trial * step).sum(-1)
-            too_far, too_short = along > 0.1 * start.abs(), (along < -0.5 * start.abs()) & (length < 1)
+            too_far = along > LAGRANGIAN.too_far * start.abs()
+            too_short = (along < -LAGRANGIAN.too_short * start.abs()) & (length < 1)
             if not bool((todo & (too_far | too_short)).any()):
                 break
             high, low = torch.where(too_far, length, high), torch.where(too_short, length, low)
