@@ -9,9 +9,11 @@ import torch
 from torch import Tensor
 
 from ..autodiff import are_transforms_active, is_grads_batched
-from ..batching import times
+from ..batching import flatten_batch, times
 from ..errors import Status
 from ..sets.feasible import Blocks
+from ..sets.values import values_of
+from . import kernels
 from .adjoint import Adjoint, adjoint
 from .outcome import joined
 from .solver import Solver
@@ -60,7 +62,7 @@ class Linearization:
         self.v_in_parts, self.lam_in_parts = v[..., solver.engines.order], self.lam[..., solver.engines.order]
         self.x = self.v_in_parts + solver.engines.gamma * self.lam_in_parts
         sets = self.sets.with_tensors(self.of_sets)
-        self.weak_in_parts = weak[..., solver.engines.order]
+        self._weak, self.weak_in_parts = weak, weak[..., solver.engines.order]
         self.D = sets.freed(sets.jacobians(self.x, solver.engines.gamma), self.weak_in_parts)
 
     @property
@@ -78,14 +80,30 @@ class Linearization:
             if not any(need_of_sets):
                 return v0_bar, (None, None)
             return v0_bar, self._of_bounds(v_bar - v0_bar)
+        compiled = self._compiled_adjoint(v_bar, lam_bar) if is_final else None
         order, gamma, G = engines.order, engines.gamma, self._G_in_parts()
         v_bar, lam_bar = v_bar[..., order], None if lam_bar is None else lam_bar[..., order]
-        v0_bar = adjoint(v_bar, lam_bar, G, engines.system, self.D, is_final=is_final)
+        if compiled is None:
+            v0_bar = adjoint(v_bar, lam_bar, G, engines.system, self.D, is_final=is_final)
+        else:
+            v0_bar = compiled[..., order]
         pulled: tuple[Tensor | None, ...] = (None,) * len(need_of_sets)
         if any(need_of_sets):
             left = -times(G, v0_bar) if lam_bar is None else lam_bar - times(G, v0_bar)
             pulled = _pull(self._project(gamma), self.of_sets, v_bar - v0_bar - left / gamma)
         return v0_bar[..., engines.inverse], pulled
+
+    def _compiled_adjoint(self, v_bar: Tensor, lam_bar: Tensor | None) -> Tensor | None:
+        """Return v_bar + S (lam_bar - G v_bar) by the kernel; None if it does not know the sets or trust a system."""
+        batch, inverse = self.lam.shape[:-1], self.solver.engines.inverse
+        values = values_of(self.sets.with_tensors(self.of_sets), batch, self.lam.device)
+        if values is None or not kernels.has_kernel_for(self.lam, values):
+            return None
+        rhs = -times(self.G, v_bar) if lam_bar is None else lam_bar - times(self.G, v_bar)
+        _, (G,), flat = flatten_batch((self.G,), (self.v_in_parts[..., inverse], self.lam, self._weak, rhs))
+        v, lam, weak, right = flat
+        out, trusted = kernels.adjoint_sets(G, v, lam, weak, values, right)
+        return v_bar + out.reshape(v_bar.shape) if bool(trusted.all()) else None
 
     def tangent(self, free: Tensor, of_sets_t: tuple[Tensor | None, ...]) -> Tensor:
         """Return lam_t for a tangent of v0 - G lam at constant lam, and tangents of the sets' tensors."""

@@ -21,6 +21,8 @@ from ..problem.terms import Sizes
 from ..sets.bounds import Bounds
 from ..sets.feasible import Blocks, FeasibleSet
 from ..sets.units import in_units
+from ..sets.values import values_of
+from . import kernels
 from .active_set import solve_active
 from .certificate import is_infeasible
 from .compiled import CompiledPlanner
@@ -243,6 +245,14 @@ class Solver:
 
     def _judge_sets(self, raw: Tensor, lam: Tensor, sets: FeasibleSet, error: Tensor) -> _Judged:
         """Judge with the projection onto the sets; count the directions that D holds, block by block."""
+        batch, G = raw.shape[:-1], self.reduction.G
+        values = values_of(sets, batch, raw.device)
+        if values is not None and kernels.has_kernel_for(raw, values):
+            _, (G,), (flat, multipliers) = flatten_batch((G,), (raw, lam))
+            verdict = kernels.judge_sets(G, flat, multipliers, values)
+            v, missed, weak, active, of_each = (x.reshape(*batch, x.shape[-1]) for x in verdict)
+            residual = self.optimality.residual(lam, missed, error)
+            return _Judged(v, residual, active, weak, (of_each[..., 0], of_each[..., 1]))
         order, inverse, gamma = self.engines.order, self.engines.inverse, self.engines.gamma
         raw = raw[..., order]
         lam_in_parts, diagonal = lam[..., order], self.engines.G_in_parts.diagonal(dim1=-2, dim2=-1)
