@@ -169,6 +169,12 @@ def test_the_plan_ends_at_its_reference(noise):
     assert float((sol.y[:, -1] - 0.1 * Y_REF).abs().max()) < 1e-9 and (sol.info.n_active > 0).any()
 
 
+def test_the_last_steps_meet_the_last_rows_of_a_moving_reference():
+    y_ref = torch.linspace(0.0, 0.2, 25, dtype=torch.float64)[:, None] * Y_REF
+    sol = paper_layer(1e-2, terminal_steps=2)(*windows(2, seed=3, scale=0.1), y_ref=y_ref)
+    assert float((sol.y[:, -2:] - y_ref[-2:]).abs().max()) < 1e-9
+
+
 def test_terminal_outputs_outside_their_set_are_infeasible():
     layer = dpc.DPCLayer(masses_data(1e-2), **SMALL, y_set=dpc.Box(-0.5, 0.5), terminal_steps=1, on_failure="nan")
     u_ini, y_ini = windows(2, seed=3, scale=0.1)
