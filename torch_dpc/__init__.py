@@ -3,7 +3,7 @@
 import importlib
 from types import ModuleType
 
-from . import attacks, plot, systems, tuning
+from . import attacks, detection, plot, systems, tuning
 from . import operators as _operators  # noqa: F401  # defines torch.ops.torch_dpc
 from .attacks import (
     BallBudget,
@@ -13,6 +13,7 @@ from .attacks import (
     PerChannelBudget,
     RelativeBallBudget,
     SparseBallBudget,
+    StealthyBudget,
 )
 from .control.controller import DPCController
 from .control.log import ClosedLoopLog
@@ -60,7 +61,9 @@ __all__ = [
     "SolveInfo",
     "SparseBallBudget",
     "Status",
+    "StealthyBudget",
     "attacks",
+    "detection",
     "collect",
     "excitation_order",
     "hankel",

@@ -11,6 +11,7 @@ from .budgets import (
     PerChannelBudget,
     RelativeBallBudget,
     SparseBallBudget,
+    StealthyBudget,
 )
 from .certificate import SensitivityBound, sensitivity_bound
 from .costs import Cost, TargetInput, TrackingError
@@ -23,7 +24,7 @@ from .random import RandomAttack
 # Short names, as in `attacks.Ball(0.1)`: the same classes.
 Ball, Box, Ellipsoid = BallBudget, BoxBudget, EllipsoidBudget
 L1Ball, PerChannel = L1BallBudget, PerChannelBudget
-RelativeBall, SparseBall = RelativeBallBudget, SparseBallBudget
+RelativeBall, SparseBall, Stealthy = RelativeBallBudget, SparseBallBudget, StealthyBudget
 
 __all__ = [
     "Attack",
@@ -54,6 +55,8 @@ __all__ = [
     "SensitivityBound",
     "SparseBall",
     "SparseBallBudget",
+    "Stealthy",
+    "StealthyBudget",
     "TargetInput",
     "TrackingError",
     "WorstCase",

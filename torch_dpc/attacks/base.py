@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import copy
 from typing import Any, NamedTuple, Protocol
 
 import torch
@@ -69,8 +70,12 @@ class Attack:
         """
         u_ini, y_ini = _window("u_ini", u_ini), _window("y_ini", y_ini)
         check_generator(generator)
-        p = self._perturb(AttackCall(u_ini, y_ini, y_ref, u_ref, generator, step))
-        return within_budget(p.to(y_ini.dtype), y_ini, self.budget)
+        attack, budget = self, self.budget.given(u_ini)
+        if budget is not self.budget:  # a budget of this call alone; the attack itself keeps no state
+            attack = copy.copy(self)
+            attack.budget = budget
+        p = attack._perturb(AttackCall(u_ini, y_ini, y_ref, u_ref, generator, step))
+        return within_budget(p.to(y_ini.dtype), y_ini, budget)
 
     def _perturb(self, call: AttackCall) -> Tensor:
         """Return p, the shape of y_ini, in float64 or the dtype of y_ini."""

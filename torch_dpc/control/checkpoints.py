@@ -41,11 +41,11 @@ def advance_with_checkpoints(
     for first in range(0, steps, every):
         segment = _Segment(loop, plant, range(first, min(first + every, steps)))
         outputs = checkpoint(segment, *segment.tensors(), use_reentrant=False)
-        parts.append(outputs[:5])
-        segment.restore(outputs[5:], segment.rest())  # the tensors that the checkpoint returned carry the graph
+        parts.append(outputs[:6])
+        segment.restore(outputs[6:], segment.rest())  # the tensors that the checkpoint returned carry the graph
         if progress is not None:
             progress(len(segment.steps))
-    dims = (-2, -2, -3, -1, -1)
+    dims = (-2, -2, -3, -1, -1, -1)
     return tuple(torch.cat(part, dim) for part, dim in zip(zip(*parts, strict=True), dims, strict=True))
 
 

@@ -53,6 +53,8 @@ class DPCController:
             "hold": go on with the rest of the previous plan, its last input held beyond its end (before any plan: the
             input nearest to zero in the set);
             "soften": widen the output bounds at the price `soft_weight` (:mod:`torch_dpc.control.soften`).
+        on_alarm: what to do when a detector mistrusts the window (`simulate(..., detector=)`): "ignore", or "hold": go
+            on with the rest of the previous plan.
         soft_weight: price of widening the output bounds by one unit, in units of the cost. Below it the plan is the one
             without softening, so it should exceed the sum of the output multipliers of ordinary plans.
         deadline: a plan that takes longer is counted in `times.late` [s]; usually the sampling time of the plant.
@@ -78,6 +80,7 @@ class DPCController:
         replan_every: int | None = None,
         *,
         on_failure: str = "raise",
+        on_alarm: str = "ignore",
         soft_weight: float = 1e6,
         deadline: float | None = None,
     ):
@@ -91,12 +94,14 @@ class DPCController:
             raise ValueError(f"{rule}, got {replan_every!r}.")
         if on_failure not in ("raise", "hold", "soften"):
             raise ValueError(f'`on_failure` must be "raise", "hold" or "soften", got {on_failure!r}.')
+        if on_alarm not in ("ignore", "hold"):
+            raise ValueError(f'`on_alarm` must be "ignore" or "hold", got {on_alarm!r}.')
         if on_failure == "soften" and not layer.feasible_set.is_box:
             raise ValueError('`on_failure="soften"` widens boxes; give the layer a SoftBox as `y_set` instead.')
         check_number("soft_weight", soft_weight, positive=True, kind="positive and finite")
         self.layer = layer
         self.replan_every = replan_every
-        self.on_failure = on_failure
+        self.on_failure, self.on_alarm = on_failure, on_alarm
         self.soft_weight = soft_weight
         self.times = PlanTimes(deadline)
         self.reset()
@@ -132,18 +137,21 @@ class DPCController:
         """How far the output bounds were widened for the plan in force, `(*batch,)`."""
         return self.state.softened_by
 
-    def step(self, u_ini: Any, y_ini: Any, *, y_ref: Any = None, u_ref: Any = None) -> Tensor:
+    def step(
+        self, u_ini: Any, y_ini: Any, *, y_ref: Any = None, u_ref: Any = None, alarm: Tensor | None = None
+    ) -> Tensor:
         """Return the input of this step, `(*batch, n_u)`, planning first where one is due.
 
         Args:
             u_ini, y_ini: the last `t_ini` inputs and outputs, `(*batch, t_ini, n)`.
             y_ref, u_ref: references over the horizon, as the layer takes them.
+            alarm: whether a detector mistrusts the window, boolean, `(*batch,)`; see `on_alarm`.
 
         Raises:
             SolveError: the problem has no solution, with `on_failure="raise"`.
         """
         if self.replans_now:
-            self._replan(u_ini, y_ini, y_ref, u_ref)
+            self._replan(u_ini, y_ini, y_ref, u_ref, alarm)
         state = self.state
         assert state.inputs is not None
         self.state = replace(state, age=state.age + 1, due=state.due - 1)
@@ -187,7 +195,7 @@ class DPCController:
         if self._past.is_full and self.replans_now:
             self._replan(*self._past.windows(), y_ref, u_ref)
 
-    def _replan(self, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any) -> None:
+    def _replan(self, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any, alarm: Tensor | None = None) -> None:
         begin = time.perf_counter()
         on_failure = "raise" if self.on_failure == "raise" else "nan"
         plan = self.plan = self.layer(u_ini, y_ini, y_ref=y_ref, u_ref=u_ref, on_failure=on_failure)
@@ -200,6 +208,8 @@ class DPCController:
                 inputs, widths = self._softened(theta, plan.u, ~solved)
             else:
                 inputs = torch.where(solved[..., None, None], inputs, self._rest(plan.u))
+        if self.on_alarm == "hold" and alarm is not None and bool(alarm.any()):
+            inputs = torch.where(alarm[..., None, None], self._rest(plan.u), inputs)
         self.state = ControllerState(
             inputs, 0, self.replan_every, Status(int(status)) if status.ndim == 0 else status, widths
         )

@@ -28,6 +28,7 @@ class ClosedLoopLog:
         p: what was added to y_ini at the plan in force, `(*batch, steps, t_ini, n_y)`.
         status: of the plan in force, a :class:`torch_dpc.Status`, `(*batch, steps)`.
         replanned: whether the plan in force was made at this step, boolean, `(*batch, steps)`.
+        alarm: whether the detector alarmed at the window of the plan in force, boolean, `(*batch, steps)`.
 
     `log[i]` is one run of a batch.
     """
@@ -39,6 +40,7 @@ class ClosedLoopLog:
     p: Tensor
     status: Tensor
     replanned: Tensor
+    alarm: Tensor
 
     @property
     def batch(self) -> torch.Size:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Any
+from typing import Any, Protocol
 
 import torch
 from torch import Tensor
@@ -17,6 +17,13 @@ from .past import Past
 Attack = Callable[..., Tensor]
 
 
+class Detector(Protocol):
+    """What judges the windows that the controller plans from, such as a `torch_dpc.detection.ConsistencyDetector`."""
+
+    def monitor(self) -> Callable[[Tensor, Tensor], Tensor]:
+        """Begin a run; return (u_ini, y_ini) -> whether the window alarms, boolean, `(*batch,)`."""
+
+
 class Loop:
     """The plant, the controller, the attack, and the last `t_ini` steps of every run.
 
@@ -26,10 +33,12 @@ class Loop:
         y_refs, u_refs: references, `(*batch, >= steps + horizon, n)`.
         attack: or None.
         generator: handed to the attack.
+        detector: or None.
 
     Attributes:
         y: the present outputs, `(*batch, n_y)`.
         p: what was added to y_ini at the plan in force, `(*batch, t_ini, n_y)`.
+        alarm: whether the window of the plan in force alarmed, `(*batch,)`.
     """
 
     def __init__(
@@ -40,10 +49,12 @@ class Loop:
         u_refs: Tensor,
         attack: Attack | None,
         generator: Any,
+        detector: Detector | None = None,
     ):
         self.port, self.controller, self.attack, self.generator = port, controller, attack, generator
         self.y_refs, self.u_refs = y_refs, u_refs
         self.data = controller.layer.data
+        self.alarms_at = None if detector is None else detector.monitor()
         self.past = Past(self.data.t_ini)
 
     @property
@@ -61,19 +72,21 @@ class Loop:
             self.past.append(u, self.y)
             self.y = self.port.step(u)
         self.p = torch.zeros(*self.batch, self.data.t_ini, self.data.n_y, dtype=torch.float64)
+        self.alarm = torch.zeros(self.batch, dtype=torch.bool)
 
     def advance(self, steps: Iterable[int], progress: Callable[[int], None] | None = None) -> tuple[Tensor, ...]:
-        """Make some steps and return u, y, p, status and replanned, with the time before their own dimensions."""
-        us, ys, ps, statuses, replanned = [], [], [], [], []
+        """Return u, y, p, status, replanned and alarm of some steps, with the time before their own dimensions."""
+        us, ys, ps, statuses, replanned, alarms = [], [], [], [], [], []
         for k in steps:
             ys.append(self.y)
             replanned.append(torch.tensor(self.controller.replans_now).expand(self.batch))
             us.append(self._step(k))
             ps.append(self.p)
             statuses.append(torch.as_tensor(self.controller.status))
+            alarms.append(self.alarm)
             if progress is not None:
                 progress(1)
-        per_step = ((us, -2), (ys, -2), (ps, -3), (statuses, -1), (replanned, -1))
+        per_step = ((us, -2), (ys, -2), (ps, -3), (statuses, -1), (replanned, -1), (alarms, -1))
         return tuple(torch.stack(values, dim) for values, dim in per_step)
 
     def _step(self, k: int) -> Tensor:
@@ -83,7 +96,9 @@ class Loop:
         refs = {"y_ref": self.y_refs[..., ahead, :], "u_ref": self.u_refs[..., ahead, :]}
         if self.attack is not None and self.controller.replans_now:
             self.p = self._checked(self.attack(u_ini, y_ini, **refs, generator=self.generator, step=k), y_ini)
-        u = self.controller.step(u_ini, y_ini + self.p, **refs)
+        if self.alarms_at is not None and self.controller.replans_now:
+            self.alarm = self.alarms_at(u_ini.detach(), (y_ini + self.p).detach())
+        u = self.controller.step(u_ini, y_ini + self.p, **refs, alarm=self.alarm)
         self.past.append(u, self.y)
         self.y = self.port.step(u)
         return u

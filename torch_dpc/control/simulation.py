@@ -13,7 +13,7 @@ from ..systems.plant import Plant, Port, per_input
 from .checkpoints import advance_with_checkpoints
 from .controller import DPCController
 from .log import ClosedLoopLog
-from .loop import Attack, Loop, side_by_side
+from .loop import Attack, Detector, Loop, side_by_side
 from .references import reference_trajectory
 
 
@@ -25,6 +25,7 @@ def simulate(
     steps: int,
     u_ref: Any = None,
     attack: Attack | Sequence[Attack] | None = None,
+    detector: Detector | None = None,
     generator: torch.Generator | Sequence[torch.Generator] | None = None,
     reset: bool | Mapping[str, Any] = True,
     batch: int | Sequence[int] | None = None,
@@ -54,6 +55,8 @@ def simulate(
         u_ref: input reference, likewise; zero by default.
         attack: `(u_ini, y_ini, *, y_ref, u_ref, generator, step)` -> p, shape of y_ini, the windows `(*batch, t_ini,
             n)`; or a list of attacks, one a run.
+        detector: judges every window that is planned from, after the attack; `log.alarm` tells, and a controller with
+            `on_alarm="hold"` does not use the window.
         generator: handed to the attack; a list holds one a run.
         reset: whether to reset the plant, or the arguments of its reset. A plant that is not reset and has no
             `measure()` makes one more step at `u_warmup`, to learn its present output.
@@ -98,13 +101,15 @@ def simulate(
         check_callable("attack", attack, optional=True)
     else:
         attack = side_by_side(attack)
-    loop = Loop(port, controller, y_refs, u_refs, attack, generator)
+    if detector is not None and checkpoint_every is not None:
+        raise ValueError("`detector` must be left out with `checkpoint_every`: a detector may have a memory.")
+    loop = Loop(port, controller, y_refs, u_refs, attack, generator, detector)
     loop.warm_up(_with_batch(plant, reset, batch), per_input("u_warmup", u_warmup, data.n_u))
     _check_batches(loop, batch)
     if checkpoint_every is None:
-        u, y, p, status, replanned = loop.advance(range(steps), progress)
+        u, y, p, status, replanned, alarm = loop.advance(range(steps), progress)
     else:
-        u, y, p, status, replanned = advance_with_checkpoints(
+        u, y, p, status, replanned, alarm = advance_with_checkpoints(
             loop, steps, check_count("checkpoint_every", checkpoint_every), progress
         )
     return ClosedLoopLog(
@@ -115,6 +120,7 @@ def simulate(
         p=p,
         status=status,
         replanned=replanned,
+        alarm=alarm,
     )
 
 

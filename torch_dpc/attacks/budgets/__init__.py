@@ -8,6 +8,7 @@ this size. A relative budget at y_ini = 0 is {0}.
 from .base import Budget
 from .entries import BoxBudget, EllipsoidBudget
 from .norms import BallBudget, L1BallBudget, PerChannelBudget, RelativeBallBudget, SparseBallBudget
+from .stealthy import QuadraticDetector, StealthyBudget
 
 __all__ = [
     "BallBudget",
@@ -16,6 +17,8 @@ __all__ = [
     "EllipsoidBudget",
     "L1BallBudget",
     "PerChannelBudget",
+    "QuadraticDetector",
     "RelativeBallBudget",
     "SparseBallBudget",
+    "StealthyBudget",
 ]

@@ -48,6 +48,10 @@ class Budget:
         """Return a random perturbation that spends the whole budget."""
         return self.minimize_linear(-standard_normal(y_ini, generator), y_ini)
 
+    def given(self, u_ini: Tensor) -> Budget:
+        """Return the budget of windows with these inputs, `(*batch, t_ini, n_u)`; most do not depend on them."""
+        return self
+
     def norm_bounds(self, y_ini: Tensor) -> list[NormBound]:
         """Return pieces whose intersection is the set, for one window `(t_ini, n_y)`.
 

@@ -184,6 +184,8 @@ class _Window:
         data = layer.data
         sizes = [n * data.t_ini for n in (data.n_u, data.n_y)] + [n * data.horizon for n in (data.n_u, data.n_y)]
         u_ini, y_ini, u_ref, y_ref = theta.split(sizes)
+        u_of_window = theta[: data.t_ini * data.n_u].reshape(-1, data.n_u)
+        budget = budget.given(u_of_window)
         self.layer, self.cost, self.budget, self.step, self.tolerance = layer, cost, budget, step, tolerance
         self.u_ini, self.y_ini = u_ini.reshape(-1, data.n_u), y_ini.reshape(-1, data.n_y)
         self.refs = {"y_ref": y_ref.reshape(-1, data.n_y), "u_ref": u_ref.reshape(-1, data.n_u)}
