@@ -43,7 +43,7 @@ def runs(layer):
     ]
 
 
-FIELDS = ("u", "y", "y_ref", "p", "status", "replanned")
+FIELDS = ("u", "y", "y_ref", "p", "status", "replanned", "alarm")
 
 
 def batch_of(logs):

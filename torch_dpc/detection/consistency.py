@@ -15,7 +15,7 @@ from ..data.recordings import as_recordings, hankel
 from .cusum import Cusum
 
 #: The residual of noise-free data is rounding. It is measured in this fraction of the largest singular value.
-RESIDUAL_FLOOR = 1e-10
+RESIDUAL_FLOOR = 1e-8
 #: Where the residual can judge, so many times the usual energy count as one usual residual. The energy of a run depends
 #: on its course: that of an undamped plant grows with time, and differs from recording to recording.
 ENERGY_ROOM = 100.0
@@ -40,7 +40,7 @@ class ConsistencyDetector:
     singular vectors span what the system does, the others what noise adds:
 
         energy   = sum over i <= rank of (u_i'w / s_i)^2,
-        residual = sum over i > rank of  (u_i'w / max(s_i, 1e-10 s_1))^2.
+        residual = sum over i > rank of  (u_i'w / max(s_i, 1e-8 s_1))^2.
 
     For noise-free data the residual of a window is 0 exactly where it is a trajectory of the system. For noisy data it
     is the Mahalanobis distance of the noise. The score that alarms at 1 is energy / a + residual / b; a, b and the

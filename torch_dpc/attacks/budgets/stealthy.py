@@ -54,10 +54,10 @@ class StealthyBudget(Budget):
         if not isinstance(budget, BallBudget) or isinstance(budget, SparseBallBudget):
             raise ValueError(f"`budget` must be a BallBudget or RelativeBallBudget, got {type(budget).__name__}.")
         self.budget, self.detector = budget, detector
-        E_u, self.E_y = detector.maps()
-        self.E_u = E_u
-        curvature, self.axes = torch.linalg.eigh(self.E_y.mT @ self.E_y)
-        self.curvature = curvature.clamp_min(0.0)
+        self.E_u, self.E_y = detector.maps()
+        # E_y = left size axes'; for noise-free data sizes differ by 1e8, and E_y'E_y would lose the small ones
+        self.left, self.size, axes = torch.linalg.svd(self.E_y, full_matrices=False)
+        self.axes = axes.mT
         self.past: Tensor | None = None  # E_u u_ini, `(*batch, k)`
 
     def given(self, u_ini: Tensor) -> StealthyBudget:
@@ -94,7 +94,9 @@ class StealthyBudget(Budget):
 
     def excess(self, p: Tensor, y_ini: Tensor) -> Tensor:
         problem = self._in_axes(y_ini)
-        of_score = (problem.score(self._to_axes(p.double())) / problem.level).clamp_min(0.0).sqrt()[..., 0] - 1
+        # Answers aim at a level that is lower by BELOW, or at the clean score, which rounding may exceed by as much.
+        level = (problem.clean * (1 + BELOW)).clamp_min(1.0)
+        of_score = (problem.score(self._to_axes(p.double())) / level).clamp_min(0.0).sqrt()[..., 0] - 1
         return torch.maximum(of_score, self.budget.excess(p.double(), y_ini.double()))
 
     def norm_bounds(self, y_ini: Tensor) -> list[NormBound]:
@@ -111,9 +113,10 @@ class StealthyBudget(Budget):
         offset = self._offset(y_ini)
         clean = offset.square().sum(-1, keepdim=True)
         radius = self.budget._reach(y_ini.detach().double())[..., 0].expand_as(clean)
-        slope = offset @ self.E_y.to(offset.device) @ self.axes.to(offset.device)
+        size = self.size.to(offset.device)
+        slope = offset @ self.left.to(offset.device) * size
         level = clean.clamp_min(1.0 - BELOW)
-        return _TwoEllipsoids(self.curvature.to(offset.device), slope, clean, radius, level)
+        return _TwoEllipsoids(size.square(), slope, clean, radius, level)
 
     def _to_axes(self, p: Tensor) -> Tensor:
         return p.flatten(-2) @ self.axes.to(p.device)
