@@ -4,6 +4,8 @@ A window of the data, `t_ini` past and `horizon` future steps, is one column; by
 (Willems, Rapisarda, Markovsky, De Moor 2005) the columns span every trajectory of a linear system, if the
 recorded input is exciting enough. Several recordings are put side by side (the mosaic-Hankel matrix of
 van Waarde, De Persis, Camlibel, Tesi 2020), so that no window runs across a seam.
+
+The file is long because the data have many ways in: trajectories, CSV files, streams, compact data.
 """
 
 from __future__ import annotations
@@ -251,6 +253,19 @@ class HankelData:
         )
         compact.__dict__["row_space"] = self.row_space.of_its_coordinates()
         return compact
+
+    def to(self, *args: Any, **options: Any) -> HankelData:
+        """Return the data on another device or in another precision, as `torch.Tensor.to`.
+
+        The rank tolerance stays that of the coarsest precision the data have had. A graph is kept.
+        """
+        data = replace(self, **{name: getattr(self, name).to(*args, **options) for name in ("Up", "Uf", "Yp", "Yf")})
+        had, now = self.recorded_as or self.Up.dtype, data.Up.dtype
+        coarsest = max((had, now), key=lambda dtype: torch.finfo(dtype).eps)
+        data = replace(data, recorded_as=None if coarsest == now else coarsest)
+        if "row_space" in self.__dict__ and (now == self.Up.dtype or not self.has_windows):
+            data.__dict__["row_space"] = self.row_space
+        return data
 
     @property
     def matrices(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -44,6 +45,10 @@ class HankelBatch:
         if len(sizes) > 1:
             raise ValueError(f"the data sets must be alike in (t_ini, horizon, n_u, n_y), got {sorted(sizes)}.")
         ((self.t_ini, self.horizon, self.n_u, self.n_y),) = sizes
+
+    def to(self, *args: Any, **options: Any) -> HankelBatch:
+        """Return every data set on another device or in another precision; see :meth:`torch_dpc.HankelData.to`."""
+        return HankelBatch([data.to(*args, **options) for data in self.members])
 
     @property
     def device(self) -> torch.device:

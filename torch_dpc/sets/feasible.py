@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterable
 from dataclasses import dataclass
-from functools import cached_property
 from typing import Any, cast
 
 import torch
@@ -13,29 +12,19 @@ from torch import Tensor, nn
 from ..autodiff import is_mapped, is_plain
 from ..checks import one_batch
 from .base import ConvexSet, Part
+from .blocks import Blocks, BlockStructure, flat, joined
 from .bounds import Bounds
 from .box import Box, NonNegative, Reals, SoftBox
 from .curved import Ball, SecondOrderCone
 from .product import Product
 
-#: The Jacobian of the projection, part by part: its diagonal `(..., groups, size)` where the set is separable, blocks
-#: `(..., groups, size, size)` otherwise.
-Blocks = list[Tensor]
-
 
 @dataclass(frozen=True, eq=False)
-class FeasibleSet:
+class FeasibleSet(BlockStructure):
     """The product of the sets of a problem.
 
     Methods other than `bounds` work in *part order*, v[..., order]: the entries of one part side by side.
-
-    Attributes:
-        parts: every set with the rows it holds for, `(groups, size)`.
-        names: what each part belongs to, "u_set" and the like, for messages.
     """
-
-    parts: list[Part]
-    names: list[str]
 
     @staticmethod
     def of(sets: Iterable[tuple[str, ConvexSet, int, int]]) -> FeasibleSet:
@@ -77,29 +66,6 @@ class FeasibleSet:
     def snapshot(self) -> FeasibleSet:
         """Return the same sets with the parameters that they have now."""
         return FeasibleSet([(cast(ConvexSet, snapshot_of(owner)), places) for owner, places in self.parts], self.names)
-
-    @cached_property
-    def order(self) -> Tensor:
-        """The rows of v in part order, `(N,)`."""
-        return torch.cat([places.reshape(-1) for _, places in self.parts])
-
-    @cached_property
-    def inverse(self) -> Tensor:
-        """Where each row of v stands in part order, `(N,)`."""
-        return self.order.argsort()
-
-    @cached_property
-    def _slices(self) -> list[tuple[ConvexSet, slice, tuple[int, ...]]]:
-        found, start = [], 0
-        for owner, places in self.parts:
-            found.append((owner, slice(start, start + places.numel()), tuple(places.shape)))
-            start += places.numel()
-        return found
-
-    @property
-    def tails(self) -> tuple[int, ...]:
-        """How many dimensions of each block of D1 are its own."""
-        return tuple(2 if owner.separable else 3 for owner, _ in self.parts)
 
     @property
     def batch_shape(self) -> torch.Size:
@@ -183,19 +149,19 @@ class FeasibleSet:
                     owner.check(name, *places.shape)
                     raise
                 shapes.append((name, value.shape[:-2]))
-                side.append(_flat(full))
+                side.append(flat(full))
         one_batch(shapes)
         inverse = self.inverse.to(device)
-        return _joined(sides[0])[..., inverse], _joined(sides[1])[..., inverse]
+        return joined(sides[0])[..., inverse], joined(sides[1])[..., inverse]
 
     def prox(self, x: Tensor, gamma: Tensor | float = 1.0) -> Tensor:
         """Return the projection of x, `(..., N)`; the proximal map where a penalty stands in place of a set.
 
         gamma is one number, or `(..., N)`, equal within every group of a set that is not separable.
         """
-        return _joined(
+        return joined(
             [
-                _flat(owner.prox(self._group(x, at, shape), self._scale(gamma, owner, at, shape)))
+                flat(owner.prox(self._group(x, at, shape), self._scale(gamma, owner, at, shape)))
                 for owner, at, shape in self._slices
             ]
         )
@@ -209,40 +175,13 @@ class FeasibleSet:
             for owner, at, shape in self._slices
         ]
 
-    def largest_of_group(self, x: Tensor) -> Tensor:
-        """Return x, `(..., N)`, with the largest entry of its group in place of each."""
-        groups = [self._group(x, at, shape) for _, at, shape in self._slices]
-        return _joined([_flat(group.amax(-1, keepdim=True).expand_as(group)) for group in groups])
-
     def largest_of_coupled(self, x: Tensor) -> Tensor:
         """Return x, `(..., N)`, with the largest of the entries that its set couples it with in place of each."""
         parts = []
         for owner, at, shape in self._slices:
             group = self._group(x, at, shape)
-            parts.append(_flat(group if owner.separable else group.amax(-1, keepdim=True).expand_as(group)))
-        return _joined(parts)
-
-    def complement_times(self, blocks: Blocks, matrix: Tensor) -> Tensor:
-        """Return (I - D1) matrix, `(..., N, k)`."""
-        out = []
-        for (owner, at, shape), D in self._with(blocks):
-            rows = matrix[..., at, :].unflatten(-2, shape)  # (..., groups, size, k)
-            moved = D[..., None] * rows if owner.separable else D @ rows
-            out.append((rows - moved).flatten(-3, -2))
-        batch = torch.broadcast_shapes(*(part.shape[:-2] for part in out))
-        return torch.cat([part.expand(*batch, *part.shape[-2:]) for part in out], dim=-2)
-
-    def freed(self, blocks: Blocks, weak: Tensor) -> Blocks:
-        """Return D1 with the identity at the rows that count as inactive, `(..., N)`; a block is freed as a whole."""
-        out = []
-        for (owner, at, shape), D in zip(self._slices, blocks, strict=True):
-            free = self._group(weak, at, shape)
-            if owner.separable:
-                out.append(torch.where(free, 1.0, D))
-            else:
-                eye = torch.eye(shape[-1], dtype=D.dtype, device=D.device)
-                out.append(torch.where(free.all(-1)[..., None, None], eye, D))
-        return out
+            parts.append(flat(group if owner.separable else group.amax(-1, keepdim=True).expand_as(group)))
+        return joined(parts)
 
     def check_values(self) -> None:
         """Raise ValueError where the parameters of a set, as they are now, do not describe one.
@@ -267,8 +206,8 @@ class FeasibleSet:
         for owner, at, shape in self._slices:
             group = self._group(small, at, shape)
             group = group if owner.separable else group.all(-1, keepdim=True).expand_as(group)
-            out.append(_flat(group & ~owner.is_point(self._group(x, at, shape))))
-        return _joined(out)
+            out.append(flat(group & ~owner.is_point(self._group(x, at, shape))))
+        return joined(out)
 
     def touching(self, v: Tensor, weak: Tensor, reach: float) -> Tensor:
         """Return how many bounds v touches where `weak` says that no multiplier holds it there, `(...)`."""
@@ -286,7 +225,7 @@ class FeasibleSet:
 
     def supports(self, d: Tensor) -> Tensor:
         """Return the supremum of <d, v> over each group's set, `(..., groups of all parts)`; it may be infinite."""
-        return _joined([owner.support(self._group(d, at, shape)) for owner, at, shape in self._slices])
+        return joined([owner.support(self._group(d, at, shape)) for owner, at, shape in self._slices])
 
     def conjugate(self, lam: Tensor, v: Tensor) -> Tensor:
         """Return the sum of the sets' conjugates at optimal multipliers, `(...)`; lam and v in the order of v."""
@@ -294,78 +233,13 @@ class FeasibleSet:
         each = (
             owner.conjugate(self._group(lam, at, shape), self._group(v, at, shape)) for owner, at, shape in self._slices
         )
-        return _joined(list(each)).sum(-1)
+        return joined(list(each)).sum(-1)
 
     def bounded_direction(self, d: Tensor) -> Tensor:
         """Return a direction near d in which the sets are bounded."""
-        return _joined(
+        return joined(
             [owner.bounded_direction(self._group(d, at, shape)).flatten(-2) for owner, at, shape in self._slices]
         )
-
-    def apply(self, blocks: Blocks, x: Tensor) -> Tensor:
-        """Return D1 x, `(..., N)`."""
-        out = []
-        for (owner, at, shape), D in zip(self._slices, blocks, strict=True):
-            group = self._group(x, at, shape)
-            out.append(_flat(D * group if owner.separable else (D @ group[..., None])[..., 0]))
-        return _joined(out)
-
-    def dense(self, blocks: Blocks) -> Tensor:
-        """Return D1 as a matrix, `(..., N, N)`."""
-        eye = torch.eye(len(self.order), dtype=blocks[0].dtype, device=blocks[0].device)
-        return eye - self.complement_times(blocks, eye)
-
-    def outer(self, x: Tensor, y: Tensor, blocks: Blocks) -> Blocks:
-        """Return the entries of x y' where D1 has entries, summed to the shapes of `blocks`."""
-        out = []
-        for (owner, at, shape), D in zip(self._slices, blocks, strict=True):
-            a, b = self._group(x, at, shape), self._group(y, at, shape)
-            out.append((a * b if owner.separable else a[..., :, None] * b[..., None, :]).sum_to_size(D.shape))
-        return out
-
-    def spectral(self, blocks: Blocks) -> tuple[Tensor, Blocks]:
-        """Return the eigenvalues of D1, `(..., N)`, and its eigenvectors block by block (ones where it is diagonal)."""
-        values, vectors = [], []
-        for (owner, _, _), D in zip(self._slices, blocks, strict=True):
-            value, vector = (D, torch.ones_like(D)) if owner.separable else torch.linalg.eigh(D)
-            values.append(_flat(value))
-            vectors.append(vector)
-        return _joined(values).clamp(0.0, 1.0), vectors
-
-    def rotate(self, vectors: Blocks, x: Tensor, *, back: bool = False) -> Tensor:
-        """Return W'x, W the eigenvectors, or W x, for x `(..., N)`."""
-        return self.apply([W if back or owner.separable else W.mT for (owner, _, _), W in self._with(vectors)], x)
-
-    def rotate_matrix(self, vectors: Blocks, G: Tensor) -> Tensor:
-        """Return W'G W, `(..., N, N)`."""
-        for (owner, at, shape), W in self._with(vectors):
-            if not owner.separable:
-                columns = G[..., at].unflatten(-1, shape)  # (..., N, groups, size)
-                turned = torch.einsum("...ngs,...gst->...ngt", columns, W).flatten(-2)
-                G = torch.cat(
-                    [x.expand(*turned.shape[:-1], -1) for x in (G[..., : at.start], turned, G[..., at.stop :])], -1
-                )
-        for (owner, at, shape), W in self._with(vectors):
-            if not owner.separable:
-                rows = G[..., at, :].unflatten(-2, shape)  # (..., groups, size, N)
-                turned = torch.einsum("...gsn,...gst->...gtn", rows, W).flatten(-3, -2)
-                G = torch.cat([G[..., : at.start, :], turned, G[..., at.stop :, :]], dim=-2)
-        return G
-
-    def _with(self, blocks: Blocks) -> Iterable[tuple[tuple[ConvexSet, slice, tuple[int, ...]], Tensor]]:
-        return zip(self._slices, blocks, strict=True)
-
-    @staticmethod
-    def _scale(gamma: Tensor | float, owner: ConvexSet, at: slice, shape: tuple[int, ...]) -> Tensor | float:
-        """Return gamma of each group, `(..., groups, 1)`; of each entry of a separable set."""
-        if isinstance(gamma, float):
-            return gamma
-        group = FeasibleSet._group(gamma, at, shape)
-        return group if owner.separable else group[..., :1]
-
-    @staticmethod
-    def _group(x: Tensor, at: slice, shape: tuple[int, ...]) -> Tensor:
-        return x[..., at].reshape(*x.shape[:-1], *shape)
 
 
 def identity_key(owner: ConvexSet) -> tuple[Any, ...]:
@@ -393,18 +267,7 @@ def snapshot_of(module: nn.Module) -> nn.Module:
     return copy
 
 
-def _flat(x: Tensor) -> Tensor:
-    """Return `(..., groups size)`; not by `flatten`, for which the older `vmap` has no rule, nor for `unflatten`."""
-    return x.reshape(*x.shape[:-2], x.shape[-2] * x.shape[-1])
-
-
 def places_of(module: nn.Module) -> list[tuple[dict[str, Any], str]]:
     """Return where a module and its children hold tensors, as parameters, buffers or attributes."""
     holders = (holder for part in module.modules() for holder in (part._parameters, part._buffers, part.__dict__))
     return [(holder, name) for holder in holders for name, value in holder.items() if isinstance(value, Tensor)]
-
-
-def _joined(parts: list[Tensor]) -> Tensor:
-    """Concatenate the last dimension, batch dimensions broadcast."""
-    batch = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
-    return torch.cat([part.expand(*batch, -1) for part in parts], dim=-1)

@@ -6,8 +6,9 @@ from dataclasses import dataclass
 
 from torch import Tensor
 
+from .blocks import Blocks
 from .bounds import Bounds
-from .feasible import Blocks, FeasibleSet
+from .feasible import FeasibleSet
 
 
 @dataclass(frozen=True, eq=False)

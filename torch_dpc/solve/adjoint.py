@@ -11,7 +11,7 @@ from torch import Tensor
 from ..autodiff import is_grads_batched
 from ..batching import lead_all, outer, times, unit_vectors
 from ..problem.projected_kkt import FullSystem
-from ..sets.feasible import Blocks
+from ..sets.blocks import Blocks
 from .projected_system import ProjectedSystem
 
 

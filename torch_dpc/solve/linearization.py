@@ -11,7 +11,7 @@ from torch import Tensor
 from ..autodiff import are_transforms_active, is_grads_batched
 from ..batching import flatten_batch, times
 from ..errors import Status
-from ..sets.feasible import Blocks
+from ..sets.blocks import Blocks
 from ..sets.values import values_of
 from . import kernels
 from .adjoint import Adjoint, adjoint

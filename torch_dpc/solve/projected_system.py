@@ -20,7 +20,8 @@ import torch
 from torch import Tensor
 
 from ..batching import flatten_batch, times
-from ..sets.feasible import Blocks, FeasibleSet
+from ..sets.blocks import Blocks
+from ..sets.feasible import FeasibleSet
 from .active_set import adjoint, solve_active
 
 

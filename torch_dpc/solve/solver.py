@@ -18,8 +18,9 @@ from ..errors import Status
 from ..problem.projected_kkt import FullSystem
 from ..problem.reduction import Reduction
 from ..problem.terms import Sizes
+from ..sets.blocks import Blocks
 from ..sets.bounds import Bounds
-from ..sets.feasible import Blocks, FeasibleSet
+from ..sets.feasible import FeasibleSet
 from ..sets.units import in_units
 from ..sets.values import values_of
 from . import kernels
