@@ -140,14 +140,22 @@ class Recovery:
             n = v.shape[-1]
             per = 1 / reduction.scale[..., :n]
             C = reduction.rows.C[..., :n, :]
-            missed = torch.nan_to_num((v - times(C, a)) * per)
-            change = torch.zeros_like(a)
+            rows, theta = reduction.rows, self.theta.detach()
+            change = times(rows.Eq_pinv, theta[..., rows.Eq_theta] - times(rows.Eq, a))
+            change = torch.where(reduction.rows.unreachable(theta)[..., None], 0.0, change)
+            missed = torch.nan_to_num((v - times(C, a + change)) * per)
             if reduction.is_selection:
-                w = _solved(reduction.kernel[..., :n, :] * per[..., None], missed)
-                change = times(reduction.kernel_in_a, w)
+                K = reduction.kernel_in_a  # what large multipliers leave along it is rounding; w follows from the plan
+                change = change - times(K, times(K.mT, a + change))
                 missed = torch.nan_to_num((v - times(C, a + change)) * per)
-            x = _solved(reduction.Ct[..., :n, :] * per[..., None], missed)
-            back = reduction.Z @ torch.linalg.inv(reduction.T) if x.shape[-1] else reduction.Z
+                change = change + times(K, _solved(reduction.kernel[..., :n, :] * per[..., None], missed))
+                missed = torch.nan_to_num((v - times(C, a + change)) * per)
+            T_inverse = torch.linalg.inv(reduction.T)
+            back, Ct = reduction.Z @ T_inverse, reduction.Ct[..., :n, :]
+            if reduction.is_selection:  # off the kernel, whose small charge would hide all else
+                along = reduction.kernel_in_a.mT @ back
+                Ct, back = Ct - reduction.kernel[..., :n, :] @ along, back - reduction.kernel_in_a @ along
+            x = _solved(Ct * per[..., None], missed)
             is_off = (missed.abs() / (1 + (v * per).abs())).amax(-1, keepdim=True) > ACCEPTANCE.residual
             return change + torch.where(is_off, times(back, x), 0.0)
 

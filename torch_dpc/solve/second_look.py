@@ -16,6 +16,8 @@ from torch import Tensor
 
 from ..problem.reduction import Reduction
 
+#: Equalities that are missed by more than this, for theta or a displacement of one unit, are not held.
+LEAK = 1e-7
 #: Rounds of polishing; each gains the digits that the system on the active rows has in double precision.
 ROUNDS = 3
 
@@ -55,6 +57,17 @@ class SecondLook:
             lam, rest = new, change - (new - lam)
             raw = self._raw(theta, lam, rest) + moved
         return lam, raw
+
+    def missed_equalities(self, theta: Tensor, lam: Tensor) -> Tensor:
+        """Return a bound on how far the plan is from Up g = u_ini, and what else is held, in units, `(*batch,)`.
+
+        Rounding does not count: it is taken off g where g is made.
+        """
+        r = self._reduction
+        found = r.error[..., r.V.shape[-2] :, :]
+        leak = torch.where(found > LEAK, found, 0.0).sum(-2)
+        moved = lam.abs() * r.G.diagonal(dim1=-2, dim2=-1) / r.scale
+        return leak[..., 0] * (theta / r.rows.theta_scale).abs().amax(-1) + leak[..., 1] * moved.sum(-1)
 
     def _raw(self, theta: Tensor, lam: Tensor, rest: Tensor) -> Tensor:
         """Return V theta - G (lam + rest)."""

@@ -215,8 +215,9 @@ class Solver:
         if isinstance(sets, Bounds):
             sets = sets.of_samples(where)
         step = partial(solver._step, sets=sets, held=before.lam != 0)
-        lam, raw = SecondLook(solver.reduction).polished(theta, before.lam, moved, step)
-        judged = solver._judged(raw, lam, sets, torch.zeros_like(lam[..., 0]), before.info[..., 1])
+        look = SecondLook(solver.reduction)
+        lam, raw = look.polished(theta, before.lam, moved, step)
+        judged = solver._judged(raw, lam, sets, look.missed_equalities(theta, lam), before.info[..., 1])
         better = judged.info[..., 2] < before.info[..., 2]
         better = better & doubtful if where is doubtful else better
         solved.put(better if where is doubtful else where[better], judged.map(lambda x: x[better]))
