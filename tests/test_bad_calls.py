@@ -4,9 +4,17 @@ import time
 
 import pytest
 
-from tests.bad_calls import attacks, control, data, layer, sets, systems
+from tests.bad_calls import attacks, control, data, layer, proofs, sets, systems
 
-ROOMS = {"data": data, "layer": layer, "sets": sets, "attacks": attacks, "control": control, "systems": systems}
+ROOMS = {
+    "data": data,
+    "layer": layer,
+    "sets": sets,
+    "attacks": attacks,
+    "control": control,
+    "systems": systems,
+    "proofs": proofs,
+}
 CALLS = [(f"{room}: {call.label}", call) for room, module in ROOMS.items() for call in module.calls()]
 AT_ONCE = 0.5  # seconds of processor time: before work starts
 

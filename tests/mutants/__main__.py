@@ -30,7 +30,7 @@ from .mutant import Mutant
 
 ROOT = Path(__file__).resolve().parents[2]
 SECONDS = 120  # of processor time: a mutant whose tests take longer hangs, and is killed
-MUTANTS: list[Mutant] = [m for room in (data, problem, solve, kernels, control, attacks) for m in room.MUTANTS]
+MUTANTS: list[Mutant] = [m for room in (control, attacks, kernels, solve, data, problem) for m in room.MUTANTS]
 
 
 def key(mutant: Mutant) -> str:

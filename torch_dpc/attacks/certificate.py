@@ -7,6 +7,7 @@ import torch
 from scipy.optimize import minimize
 from torch import Tensor
 
+from ..checks import check_type
 from ..errors import SolveError
 from ..layer import DPCLayer
 from .budgets import Budget
@@ -71,6 +72,9 @@ def sensitivity_bound(layer: DPCLayer, budget: Budget | None = None, *, outputs:
         >>> bool((layer(u[:4], y[:4] + p).u - layer(u[:4], y[:4]).u).norm() <= L * p.norm())
         True
     """
+    check_type("layer", layer, DPCLayer)
+    if budget is not None:
+        check_type("budget", budget, Budget)
     if not layer.feasible_set.is_box:
         raise ValueError("`layer` must have boxes as its sets.")
     reduction, data = layer.reduction.detach(), layer.data

@@ -8,7 +8,7 @@ from typing import Any
 
 import torch
 
-from ..checks import check_callable, check_count, check_generator, check_type
+from ..checks import check_batch, check_callable, check_count, check_generator, check_type
 from ..systems.plant import Plant, Port, per_input
 from .checkpoints import advance_with_checkpoints
 from .controller import DPCController
@@ -137,13 +137,13 @@ def _with_batch(
             "by side with torch_dpc.systems.Many."
         )
     arguments = dict(reset) if isinstance(reset, Mapping) else {}
-    return {**arguments, "batch": (batch,) if isinstance(batch, int) else tuple(batch)}
+    return {**arguments, "batch": check_batch("batch", batch)}
 
 
 def _check_batches(loop: Loop, batch: int | Sequence[int] | None) -> None:
     """Raise ValueError where the plant, the references and what was asked for differ in their runs."""
     runs = loop.batch
-    if batch is not None and runs != ((batch,) if isinstance(batch, int) else tuple(batch)):
+    if batch is not None and runs != check_batch("batch", batch):
         raise ValueError(f"`batch` is {batch!r}, and the plant runs {tuple(runs)}.")
     for name, reference in (("y_ref", loop.y_refs), ("u_ref", loop.u_refs)):
         own = reference.shape[:-2]

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ... import plot
-from ...checks import as_data
+from ...checks import as_data, check_number, check_type
 from ...errors import Status
 from ...layer import DPCLayer
 from ..base import within_budget
@@ -137,11 +137,12 @@ def worst_case(
         raise ImportError("`worst_case` needs Clarabel: pip install torch_dpc[exact]") from error
     if not isinstance(cost, TargetInput):
         raise ValueError(f"`cost` must be a TargetInput, whose psi is convex in the plan, got {type(cost).__name__}.")
+    check_type("layer", layer, DPCLayer)
+    check_type("budget", budget, Budget)
     if not layer.feasible_set.is_box:
         raise ValueError("`layer` must have boxes as its sets: curved sets have more than three states a row.")
-    if not time_limit > 0:
-        raise ValueError(f"`time_limit` must be positive, got {time_limit!r}.")
-    if not tolerance >= 1e-6:
+    check_number("time_limit", time_limit, positive=True, finite=False)
+    if not check_number("tolerance", tolerance, kind="at least 1e-6 and finite") >= 1e-6:
         raise ValueError(f"`tolerance` must be at least 1e-6, got {tolerance!r}.")
     u_ini, y_ini = as_data("u_ini", u_ini), as_data("y_ini", y_ini)
     theta, _ = layer.flatten(u_ini, y_ini, y_ref, u_ref)
