@@ -87,7 +87,7 @@ package: $(ENV)  ## sdist and wheel into dist/, tried in a clean environment wit
 	python ../../tests/run_readme.py ../../README.md && python -c 'from torch_dpc.solve import kernels; print("vector instructions:", kernels.instructions())'
 
 clean:  ## remove what the other targets leave, but keep .venv
-	rm -rf results site build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
+	rm -rf results site jupyter_execute .jupyter_cache build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache .import_linter_cache
 	find . -name .venv -prune -o -name __pycache__ -type d -exec rm -rf {} +
 
 distclean: clean  ## remove .venv and the compiled kernels too

@@ -31,13 +31,13 @@ class AttackEnv(gymnasium.Env[Array, Array]):
     One step is one plan: the attacker sees the window that the controller is about to be given and chooses p; the
     controller plans with it and applies `replan_every` steps of its plan. The plant itself never sees p.
 
-        action        a in [-1, 1]^(t_ini n_y);  p = Proj(reach a), the nearest point of the budget, where reach is how
-                      far the budget goes along each entry. Every point of a convex budget is the image of some action.
-        observation   u_ini, y_ini, then u_ref and y_ref over the horizon, in physical units, then the elapsed share of
-                      the episode; flattened, time first
-        reward        - psi of the plan: attackers make psi small
-        terminated    the plant says `crashed` (a quadrotor does)
-        truncated     after `steps` steps of the plant
+    - action: a in [-1, 1]^(t_ini n_y); p = Proj(reach a), the nearest point of the budget, where reach is how far the
+      budget goes along each entry. Every point of a convex budget is the image of some action.
+    - observation: u_ini, y_ini, then u_ref and y_ref over the horizon, in physical units, then the elapsed share of the
+      episode; flattened, time first.
+    - reward: -psi of the plan; attackers make psi small.
+    - terminated: the plant says `crashed` (a quadrotor does).
+    - truncated: after `steps` steps of the plant.
 
     `info` of a step has `p`, `(t_ini, n_y)`, `cost` (psi), and the plant's inputs `u` and outputs `y` during the step,
     `(replan_every, n)`.
