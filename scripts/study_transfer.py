@@ -40,6 +40,12 @@ FULL, RANDOM = "everything", "nothing: random noise"
 SEARCHES = (20, 100, 500)  # queries a window
 DIRECTIONS = 10
 TITLES = {"masses": "Oscillating masses", "quadrotor": "Quadrotor"}
+LOOKS = {"psi, one step or search": ("o", "#d55e00"), "psi, projected gradient": ("s", "#35178c")}
+LOOKS["error in closed loop"] = ("D", "#0072b2")
+#: How what is known begins -> the heading it is drawn under.
+GROUPS = {"everything": "everything", "other recording": "other data", "half": "other data", "150": "other data"}
+GROUPS |= {"lambda_g": "other lambda_g", "lambda_s": "other lambda_s", "horizon": "other horizon or past"}
+GROUPS |= {"past": "other horizon or past", "Q": "other Q", "all of it": "all of it off", "nothing": "nothing"}
 HEAD = """# How much of an attack survives partial knowledge
 
 Shares of what Algorithm 1 with full knowledge does: of its decrease of psi on held-out windows, and on the masses of
@@ -143,17 +149,34 @@ def table(rows: Rows, plant: str) -> list[str]:
     return [*lines, "", f"Windows without a plan, left out: {int(rows['unsolved'][rows['plant'] == plant].sum())}."]
 
 
+def group_of(knows: str) -> str:
+    """Return the heading under which a kind of knowledge is drawn."""
+    for start, group in GROUPS.items():
+        if knows.startswith(start):
+            return group
+    return "the controller's answers alone"
+
+
 def plot(path: Path, rows: Rows) -> None:
-    """Draw the shares, one panel a plant, one line a kind of knowledge."""
+    """Draw the shares, one panel a plant, one line a kind of knowledge under the heading of its group."""
     style()
     lines = cases(rows, PLANTS[0])
-    figure, panels = plt.subplots(1, 2, figsize=(8.4, 8.0), sharey=True, width_ratios=(1.2, 1))
-    looks = {"psi, one step or search": ("o", "#d55e00"), "psi, projected gradient": ("s", "#35178c")}
-    looks["error in closed loop"] = ("D", "#0072b2")
+    figure, panels = plt.subplots(1, 2, figsize=(9.0, 10.0), sharey=True, width_ratios=(1.2, 1))
+    places: list[float] = []
+    place, group = -1.0, ""
+    for _, knows, _ in lines:
+        place += 2 if group_of(knows) != group else 1
+        group = group_of(knows)
+        places.append(place)
+        if len(places) == 1 or places[-2] < place - 1:
+            look = {"transform": panels[0].get_yaxis_transform(), "ha": "right", "va": "center", "weight": "bold"}
+            panels[0].text(-0.02, place - 1, group, **look)
+            for axes in panels:
+                axes.axhline(place - 1.5, color="0.8", linewidth=0.6)
     for axes, plant in zip(panels, PLANTS, strict=True):
-        for place, (_, knows, methods) in enumerate(lines):
+        for place, (_, knows, methods) in zip(places, lines, strict=True):
             drawn = [(methods[0], "share", -0.25), (MORE_STEPS, "share", 0.0), (methods[0], "error_share", 0.25)]
-            for (method, column, shift), (marker, colour) in zip(drawn, looks.values(), strict=True):
+            for (method, column, shift), (marker, colour) in zip(drawn, LOOKS.values(), strict=True):
                 values = 100 * pick(rows, plant, knows, method, column)
                 if len(values) and np.isfinite(values).all():
                     axes.hlines(place + shift, values.min(), values.max(), color=colour, linewidth=1.2, alpha=0.6)
@@ -161,16 +184,13 @@ def plot(path: Path, rows: Rows) -> None:
         axes.axvline(100, color="black", linewidth=0.8, linestyle=(0, (4, 2)))
         axes.axvline(0, color="black", linewidth=0.8)
         axes.set_title(TITLES[plant])
-    kinds = [kind for kind, *_ in lines]
-    for place in range(1, len(kinds)):
-        if kinds[place] != kinds[place - 1]:
-            for axes in panels:
-                axes.axhline(place - 0.5, color="black", linewidth=0.5)
     names = [knows.replace("lambda", r"$\lambda$").replace(" x ", " × ") for _, knows, _ in lines]
-    panels[0].set_yticks(range(len(lines)), [re.sub(r"\$_(\w)", r"_\1$", name) for name in names])
-    figure.supxlabel("share of what Algorithm 1 does with full knowledge [%]", fontsize=10)
-    panels[0].set_ylim(len(lines) - 0.5, -0.5)
-    for name, (marker, colour) in looks.items():
+    panels[0].set_yticks(places, [re.sub(r"\$_(\w)", r"_\1$", name) for name in names])
+    seeds = len(np.unique(rows["seed"]))
+    text = f"share of what Algorithm 1 does with full knowledge [%]; mean and range of {seeds} seeds"
+    figure.supxlabel(text, fontsize=10)
+    panels[0].set_ylim(places[-1] + 0.5, -0.6)
+    for name, (marker, colour) in LOOKS.items():
         panels[0].plot([], [], marker, color=colour, markersize=4, label=name)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
     figure.savefig(path)

@@ -11,7 +11,8 @@ recording. Default is both. A run that was killed goes on where it was when star
 Leaves, in results/:
 
     adversary_{plant}.csv       every comparison: decrease of psi and time on held-out windows, error in closed loop
-    adversary_{plant}.md, .png  the same as tables and a picture
+    adversary_{plant}.md        the same as tables
+    adversary_{plant}_training.png, _windows.png, _loop.png     one picture a story
     adversary_{plant}_curves.csv                the training, record by record
     adversary_{plant}_{mode}.safetensors        the network, and what is needed to go on training
     adversary_{plant}_recording.safetensors     the windows it is trained on
@@ -30,7 +31,7 @@ import torch.distributed as dist
 
 from scripts.adversary import judge
 from scripts.adversary.losses import LoopLoss, WindowLosses, psi_at
-from scripts.adversary.report import picture, windows_table, write_report
+from scripts.adversary.report import pictures, windows_table, write_report
 from scripts.adversary.training import Stage, process_group, rank, read_tensors, train, world, write_tensors
 from scripts.experiments.closed_loops import HELD_OUT, TRAINING, Windows
 from scripts.shared.command import arguments, run_all, versions
@@ -230,7 +231,7 @@ def main(argv: list[str] | None = None) -> None:
     write_rows(name.with_suffix(".csv"), compare(training, modes, args.seeds, args.workers), note)
     rows = read_rows(name.with_suffix(".csv"))
     write_report(name.with_suffix(".md"), rows, args.plant, training.plant.rhos, note, judge.TIMED_BATCH)
-    picture(name.with_suffix(".png"), rows, read_rows(name.with_name(name.name + "_curves.csv")), training.plant.rhos)
+    pictures(name, rows, read_rows(name.with_name(name.name + "_curves.csv")), training.plant.rhos)
     print("\n".join(windows_table(rows, training.plant.rhos)))
     print(f"Adversaries of the {args.plant}: {name.with_suffix('.md')}, {time.perf_counter() - began:.0f} s")
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -111,47 +112,53 @@ def write_report(path: Path, rows: Rows, plant: str, rhos: Sequence[float], note
     path.write_text("\n".join(lines) + "\n")
 
 
-def picture(path: Path, rows: Rows, curves: Rows, rhos: Sequence[float]) -> None:
-    """Draw the training, the decrease of psi against the time it takes, and the error in closed loop."""
+def pictures(stem: Path, rows: Rows, curves: Rows, rhos: Sequence[float]) -> None:
+    """Draw the training, the decrease of psi against time, and the error in closed loop, one picture each."""
     style()
-    figure, (left, middle, right) = plt.subplots(1, 3, figsize=(10.2, 3.6))
+    for name, draw in (("training", _training), ("windows", _windows), ("loop", _loop)):
+        figure, axes = plt.subplots(figsize=(6.4, 4.4))
+        draw(axes, rows if name != "training" else curves, rhos)
+        axes.legend(fontsize=8, frameon=True)
+        figure.savefig(stem.with_name(f"{stem.name}_{name}.png"))
+        plt.close(figure)
+
+
+def _training(axes: Any, curves: Rows, rhos: Sequence[float]) -> None:
     for mode in dict.fromkeys(curves["mode"]):
         mine = curves["mode"] == mode
         imitated = curves["total"][mine & (curves["stage"] == "imitate")].max()
-        left.plot(curves["total"][mine] - imitated, curves["of_algorithm1"][mine], **{**LOOKS[mode], "marker": "None"})
-    left.axhline(1.0, color=COLOURS[POISON], linestyle=(0, (4, 2)))
-    left.axvline(0.0, color="grey", linestyle=":")
-    left.set(xlim=(-SHOWN, None))
-    left.set(
-        title="training, on held-out data",
-        xlabel="iteration after the imitation",
-        ylabel="effect relative to Algorithm 1",
-    )
+        look = {**LOOKS[mode], "marker": "None", "label": TITLES[mode]}
+        axes.plot(curves["total"][mine] - imitated, curves["of_algorithm1"][mine], **look)
+    axes.axhline(1.0, color=COLOURS[POISON], linestyle=(0, (4, 2)), label=TITLES[POISON])
+    axes.axvline(0.0, color="grey", linestyle=":")
+    axes.set(xlim=(-SHOWN, None), title="training, on held-out data")
+    axes.set(xlabel="iteration after the imitation", ylabel="effect relative to Algorithm 1")
+
+
+def _windows(axes: Any, rows: Rows, rhos: Sequence[float]) -> None:
     for name in names_in(rows, HELD_OUT_WINDOWS):
         points = [
             [float(chosen(rows, column, HELD_OUT_WINDOWS, name, rho)[0]) for rho in rhos]
             for column in ("microseconds", "of_algorithm1")
         ]
-        middle.plot(*points, linestyle="None", label=TITLES[name], **LOOKS[name])
-    middle.axhline(1.0, color=COLOURS[POISON], linestyle=(0, (4, 2)))
-    middle.set(
-        title="held-out windows", xscale="log", xlabel="time a sample [µs]", ylabel="decrease of psi / Algorithm 1's"
-    )
+        axes.plot(*points, linestyle="None", label=TITLES[name], **LOOKS[name])
+    axes.axhline(1.0, color=COLOURS[POISON], linestyle=(0, (4, 2)))
+    axes.set(title="held-out windows, one point a rho", xscale="log", xlabel="time a sample in a batch [µs]")
+    axes.set_ylabel("decrease of psi / Algorithm 1's")
+
+
+def _loop(axes: Any, rows: Rows, rhos: Sequence[float]) -> None:
     setting = next(s for s in dict.fromkeys(rows["setting"]) if s != HELD_OUT_WINDOWS)
     percents = [100 * rho for rho in rhos]
+    seeds = 0
     for name in names_in(rows, setting):
         if name != RANDOM:  # far below the others
             error, base = (
                 np.array([chosen(rows, "mean_error", setting, n, rho) for rho in rhos]) for n in (name, POISON)
             )
-            ratio = error / base
-            right.plot(percents, error.mean(axis=1) / base.mean(axis=1), label=TITLES[name], **LOOKS[name])
-            right.fill_between(percents, ratio.min(axis=1), ratio.max(axis=1), color=LOOKS[name]["color"], alpha=0.12)
-    right.set(title=f"closed loop, {setting}", xlabel=r"$\rho$ [%]", ylabel="error / Algorithm 1's")
-    right.set_xticks(percents)
-    handles = {
-        label: line for axes in (middle, right) for line, label in zip(*axes.get_legend_handles_labels(), strict=True)
-    }
-    figure.legend(handles.values(), handles.keys(), loc="outside upper center", ncols=3)
-    figure.savefig(path)
-    plt.close(figure)
+            ratio, seeds = error / base, error.shape[1]
+            axes.plot(percents, error.mean(axis=1) / base.mean(axis=1), label=TITLES[name], **LOOKS[name])
+            axes.fill_between(percents, ratio.min(axis=1), ratio.max(axis=1), color=LOOKS[name]["color"], alpha=0.12)
+    axes.set(title=f"closed loop, {setting}: ratio of means over {seeds} seeds, band: smallest to largest seed")
+    axes.set(xlabel=r"$\rho$ [%]", ylabel="error / Algorithm 1's")
+    axes.set_xticks(percents)

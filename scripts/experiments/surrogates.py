@@ -36,11 +36,11 @@ SURROGATES: dict[str, dict[str, Any]] = {
     "horizon 10 for 25": {"horizon": 10},
     "horizon 20 for 25": {"horizon": 20},
     "horizon 35 for 25": {"horizon": 35},
+    "past of 4 for 6": {"t_ini": 4},
     "Q / 100": {"Q": 0.01},
     "Q / 10": {"Q": 0.1},
     "Q x 10": {"Q": 10.0},
     "Q x 100": {"Q": 100.0},
-    "past of 4 for 6": {"t_ini": 4},
     "all of it off": {"other": True, "noise": 1e-2, "horizon": 20, "lambda_s": 0.1, "lambda_g": 10.0, "Q": 0.5},
 }
 

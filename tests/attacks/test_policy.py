@@ -421,7 +421,8 @@ def test_a_small_run_of_the_script(tmp_path):
         1 + 7 * 3
     )
     assert (rows["of_algorithm1"][rows["attack"] == "projected_gradient"][:3] >= 1).all()  # never worse
-    assert (tmp_path / "adversary_masses.png").stat().st_size > 10_000
+    for story in ("training", "windows", "loop"):
+        assert (tmp_path / f"adversary_masses_{story}.png").stat().st_size > 10_000
     assert "| policy trained in closed loop |" in (tmp_path / "adversary_masses.md").read_text()
 
 
