@@ -9,17 +9,21 @@ from .budgets import (
     EllipsoidBudget,
     L1BallBudget,
     PerChannelBudget,
+    PerSampleBudget,
     RelativeBallBudget,
     SparseBallBudget,
     StealthyBudget,
 )
 from .certificate import SensitivityBound, sensitivity_bound
 from .costs import Cost, TargetInput, TrackingError
+from .ensemble import Ensemble
 from .exact import WorstCase, worst_case
 from .gradient import FrankWolfeAttack, LinearizedAttack, ProjectedGradientAttack
 from .policy import AttackPolicy, PolicyAttack
 from .query import FiniteDifferenceAttack, RandomSearchAttack
 from .random import RandomAttack
+from .robustness import RobustnessCurve, robustness_curve
+from .signal import RunError, SignalAttack
 
 # Short names, as in `attacks.Ball(0.1)`: the same classes.
 Ball, Box, Ellipsoid = BallBudget, BoxBudget, EllipsoidBudget
@@ -37,6 +41,7 @@ __all__ = [
     "Cost",
     "Ellipsoid",
     "EllipsoidBudget",
+    "Ensemble",
     "FiniteDifferenceAttack",
     "FrankWolfeAttack",
     "L1Ball",
@@ -44,6 +49,7 @@ __all__ = [
     "LinearizedAttack",
     "PerChannel",
     "PerChannelBudget",
+    "PerSampleBudget",
     "Planner",
     "PolicyAttack",
     "Predictor",
@@ -52,7 +58,10 @@ __all__ = [
     "RandomSearchAttack",
     "RelativeBall",
     "RelativeBallBudget",
+    "RobustnessCurve",
+    "RunError",
     "SensitivityBound",
+    "SignalAttack",
     "SparseBall",
     "SparseBallBudget",
     "Stealthy",
@@ -60,6 +69,7 @@ __all__ = [
     "TargetInput",
     "TrackingError",
     "WorstCase",
+    "robustness_curve",
     "sensitivity_bound",
     "worst_case",
 ]

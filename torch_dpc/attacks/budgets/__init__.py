@@ -7,7 +7,7 @@ this size. A relative budget at y_ini = 0 is {0}.
 
 from .base import Budget
 from .entries import BoxBudget, EllipsoidBudget
-from .norms import BallBudget, L1BallBudget, PerChannelBudget, RelativeBallBudget, SparseBallBudget
+from .norms import BallBudget, L1BallBudget, PerChannelBudget, PerSampleBudget, RelativeBallBudget, SparseBallBudget
 from .stealthy import QuadraticDetector, StealthyBudget
 
 __all__ = [
@@ -17,6 +17,7 @@ __all__ = [
     "EllipsoidBudget",
     "L1BallBudget",
     "PerChannelBudget",
+    "PerSampleBudget",
     "QuadraticDetector",
     "RelativeBallBudget",
     "SparseBallBudget",

@@ -205,6 +205,36 @@ class PerChannelBudget(Budget):
         return pieces
 
 
+class PerSampleBudget(Budget):
+    """A budget for each sample of the window on its own: what a sensor may report at one time.
+
+    Args:
+        budget: any budget; each sample is a window of one row to it. A relative one is relative to that sample.
+
+    Example:
+        >>> budget, y_ini = PerSampleBudget(RelativeBallBudget(0.1)), torch.tensor([[3.0, 4.0], [0.0, 20.0]])
+        >>> budget.project(torch.ones(2, 2), y_ini)
+        tensor([[0.3536, 0.3536],
+                [1.0000, 1.0000]])
+    """
+
+    def __init__(self, budget: Budget):
+        self.budget = budget
+        self.convex = budget.convex
+
+    def minimize_linear(self, c: Tensor, y_ini: Tensor) -> Tensor:
+        return self.budget.minimize_linear(c[..., None, :], y_ini[..., None, :])[..., 0, :]
+
+    def project(self, p: Tensor, y_ini: Tensor) -> Tensor:
+        return self.budget.project(p[..., None, :], y_ini[..., None, :])[..., 0, :]
+
+    def random(self, y_ini: Tensor, generator: Any = None) -> Tensor:
+        return self.budget.random(y_ini[..., None, :], generator)[..., 0, :]
+
+    def excess(self, p: Tensor, y_ini: Tensor) -> Tensor:
+        return self.budget.excess(p[..., None, :], y_ini[..., None, :]).amax(-1)
+
+
 def _split(p: Tensor) -> Tensor:
     """Make one-channel windows of the channels, `(*batch, n_y, t_ini, 1)`."""
     return p.mT[..., None]
