@@ -33,6 +33,7 @@ class ConfiguredModule(nn.Module):
     du_set: ConvexSet | None
     regularizer: str
     terminal_steps: int
+    affine: bool
     backward_system: str
     solver: str
     on_failure: str
@@ -60,7 +61,7 @@ class ConfiguredModule(nn.Module):
     @property
     def _given(self) -> GivenWeights:
         """The weights as they are now."""
-        return GivenWeights(self.Q, self.R, self.lambda_g, self.lambda_s, self.lambda_u, self.R_du)
+        return GivenWeights(self.Q, self.R, self.lambda_g, self.lambda_s, self.lambda_u, self.R_du, self.Q_terminal)
 
     @property
     def backward(self) -> str:
@@ -103,7 +104,7 @@ class ConfiguredModule(nn.Module):
 
     def own_tensors(self) -> list[Tensor]:
         """Return the weights that are tensors, then the parameters of the sets."""
-        weights = (self.Q, self.R, self.R_du, self.lambda_g, self.lambda_s, self.lambda_u)
+        weights = (self.Q, self.R, self.R_du, self.lambda_g, self.lambda_s, self.lambda_u, self.Q_terminal)
         sets = [self.u_set, self.y_set] if self.du_set is None else [self.u_set, self.y_set, self.du_set]
         found = [weight for weight in weights if isinstance(weight, Tensor)]
         for owner in sets:
@@ -111,7 +112,10 @@ class ConfiguredModule(nn.Module):
         return found
 
     def flatten(self, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any) -> tuple[Tensor, torch.dtype]:
-        """Return (u_ini, y_ini, u_ref, y_ref) flattened, `(*batch, n_theta)` in float64, and the caller's dtype."""
+        """Return (u_ini, y_ini, u_ref, y_ref) flattened, `(*batch, n_theta)` in float64, and the caller's dtype.
+
+        For affine systems a 1 stands before them.
+        """
         data = self.data
         u_ini = window("u_ini", u_ini, data.t_ini, data.n_u, "n_u")
         y_ini = window("y_ini", y_ini, data.t_ini, data.n_y, "n_y")
@@ -126,6 +130,8 @@ class ConfiguredModule(nn.Module):
             theta = torch.cat([part.reshape(-1) for part in parts])
         else:
             theta = torch.cat([part.flatten(-2) for part in with_one_batch(parts)], dim=-1)
+        if self.affine:
+            theta = torch.cat([torch.ones_like(theta[..., :1]), theta], dim=-1)
         return (theta if theta.dtype == torch.float64 else theta.double()), dtype
 
     def get_extra_state(self) -> Tensor:

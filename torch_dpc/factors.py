@@ -21,7 +21,7 @@ from .problem.problem import Problem, rows_of
 from .problem.reduction import Reduction, reduce
 from .problem.rows import DataRows
 from .problem.terms import Terms
-from .problem.weights import Weights, penalty, weight_matrix
+from .problem.weights import Weights, output_weight, penalty, weight_matrix
 from .settings import GivenWeights, Setup
 from .solve.engines import Sets
 from .solve.solver import Solver
@@ -122,7 +122,7 @@ def problem_of(setup: Setup, given: GivenWeights, device: torch.device) -> Probl
     """
     data = setup.data
     weights = Weights(
-        Q=weight_matrix("Q", given.Q, data.n_y, data.horizon).to(device),
+        Q=output_weight(given.Q, given.Q_terminal, data.n_y, data.horizon).to(device),
         R=weight_matrix("R", given.R, data.n_u, data.horizon).to(device),
         lambda_g=penalty("lambda_g", given.lambda_g).to(device),
         lambda_s=penalty("lambda_s", given.lambda_s).to(device),

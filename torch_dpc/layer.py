@@ -41,6 +41,8 @@ class DPCLayer(ConfiguredModule):
         lambda_u                 lambda_u |Up g - u_ini|^2 in place of Up g = u_ini
         R_du, du_set             + 1/2 |du|_R_du^2 and du in DU, du_t = u_t - u_(t-1), from the last of u_ini on
         terminal_steps           the last outputs of the plan equal their reference
+        affine                   1'g = 1, for affine systems and operating points away from zero
+        Q_terminal               the weight of the last output of the plan, in place of Q
 
     Args:
         data: the recorded trajectories.
@@ -54,6 +56,10 @@ class DPCLayer(ConfiguredModule):
         lambda_u: penalty on the mismatch of the initial input; `None` where that is to be exact.
         regularizer: "projection", the paper's |M g|^2, or "identity", |g|^2.
         terminal_steps: so many last outputs equal y_ref.
+        affine: combine the recorded windows with 1'g = 1 (Berberich, Koehler, Mueller, Allgoewer, "Linear tracking MPC
+            for nonlinear systems - part II: the data-driven case", 2022): the data need not be centred, and predictions
+            are those of the affine system, x+ = A x + B u + c.
+        Q_terminal: weight of the last output, positive semidefinite: a number or `(n_y, n_y)`; `None` for that of Q.
         backward: "reduced", the exact reduced system, or "full", the paper's projected KKT system.
         solver: the forward engine: "newton" (batched), "daqp" (one by one), or "auto".
         on_failure: "raise", or "nan" to mark samples that have no solution and return the others.
@@ -89,6 +95,8 @@ class DPCLayer(ConfiguredModule):
         lambda_u: Any = None,
         regularizer: str = "projection",
         terminal_steps: int = 0,
+        affine: bool = False,
+        Q_terminal: Any = None,
         backward: str = "reduced",
         solver: str = "auto",
         on_failure: str = "raise",
@@ -96,12 +104,13 @@ class DPCLayer(ConfiguredModule):
         super().__init__()
         self.data = data
         self.Q, self.R, self.lambda_g, self.lambda_s = Q, R, lambda_g, lambda_s
-        self.lambda_u, self.R_du = lambda_u, R_du
+        self.lambda_u, self.R_du, self.Q_terminal = lambda_u, R_du, Q_terminal
         self.u_set = Reals() if u_set is None else u_set
         self.y_set = Reals() if y_set is None else y_set
         self.du_set = du_set
         self.regularizer = regularizer
         self.terminal_steps = terminal_steps
+        self.affine = affine
         self.backward_system = backward
         self.solver = solver
         self.on_failure = on_failure
@@ -147,7 +156,8 @@ class DPCLayer(ConfiguredModule):
         """Plan by an operator, while torch compiles or exports."""
         text, tensors = described(self) if torch.compiler.is_exporting() else ("", self.own_tensors())
         data, weights = self.data, (self.Q, self.R, self.R_du, self.lambda_g, self.lambda_s, self.lambda_u)
-        theta, dtype = flat_parameters(data, u_ini, y_ini, y_ref, u_ref, batches_of(data, weights))
+        batches = batches_of(data, (*weights, self.Q_terminal))
+        theta, dtype = flat_parameters(data, u_ini, y_ini, y_ref, u_ref, batches, affine=self.affine)
         rates = self.R_du is not None or self.du_set is not None
         sizes = [data.horizon, data.n_u, data.n_y, data.horizon * data.n_u if rates else 0]
         on_failure = self.on_failure if on_failure is None else on_failure
@@ -183,7 +193,7 @@ class DPCLayer(ConfiguredModule):
             one_batch([("the samples", theta.shape[:-1]), *factored.problem.batches, *batches])
         on_failure = self.on_failure if on_failure is None else check_choice("on_failure", on_failure)
         planned = plan(factored.solver, theta, factored.reduction, sets, on_failure)
-        return solution_of(Recovery(self.data, factored.reduction, factored.solver, sets, dtype, theta, planned))
+        return solution_of(Recovery(self._setup.data, factored.reduction, factored.solver, sets, dtype, theta, planned))
 
     def bounds(self, device: torch.device) -> tuple[Tensor, Tensor]:
         """Return the bounds of (u, y, du) flattened, `(N,)` or `(*batch, N)` each, float64, with their graph.
@@ -203,11 +213,12 @@ class DPCLayer(ConfiguredModule):
         """
         theta, _ = self.flatten(u_ini, y_ini, y_ref, u_ref)
         weights = problem_of(self._setup, self._given, theta.device).weights
-        if weights.are_batched or isinstance(self.data, HankelBatch):
+        data = self._setup.data
+        if weights.are_batched or isinstance(data, HankelBatch):
             raise ValueError("`compact_form` takes one problem; the weights or the data have a batch dimension.")
         if self.du_set is not None:
             raise ValueError("`compact_form` has no rows for changes of the input; leave out `du_set`.")
-        return compact_form(self.data, weights, theta, self.terms)
+        return compact_form(data, weights, theta, self.terms)
 
     def config(self) -> dict[str, Any]:
         """Return the arguments of the constructor beyond the data, as they are now."""
@@ -223,6 +234,8 @@ class DPCLayer(ConfiguredModule):
             "lambda_u": self.lambda_u,
             "regularizer": self.regularizer,
             "terminal_steps": self.terminal_steps,
+            "affine": self.affine,
+            "Q_terminal": self.Q_terminal,
             "backward": self.backward_system,
             "solver": self.solver,
             "on_failure": self.on_failure,

@@ -89,13 +89,19 @@ def layer_to_tree(
         raise ValueError("a layer on a batch of data sets cannot be saved: save one layer for each.")
     if data:
         held.require_windows()
-    kept = held if data else held.compressed() if compact is None else compact
+    kept = held if data else compact_data(layer) if compact is None else compact
     text = {
         "version": VERSION,
         "data": _data_to_tree(kept, writer),
         "arguments": {name: writer.tree(value, f"`{name}`", name) for name, value in arguments_of(layer).items()},
     }
     return text, writer.tensors
+
+
+def compact_data(layer: Any) -> HankelData:
+    """Return the data of a layer compact; for affine systems with the row of ones, which its factor must know."""
+    compact: HankelData = (layer.data.with_ones if layer.affine else layer.data).compressed()
+    return compact
 
 
 def layer_from_tree(cls: type[Any], text: Mapping[str, Any], tensors: Mapping[str, Tensor]) -> Any:
@@ -129,6 +135,7 @@ def _data_from_tree(tree: Mapping[str, Any], reader: _Reader) -> HankelData:
     columns = matrices["Up"].shape[-1]
     for name, matrix in matrices.items():
         rows = numbers["t_ini" if name[1] == "p" else "horizon"] * numbers["n_u" if name[0] == "U" else "n_y"]
+        rows += name == "Up" and len(matrix) == rows + 1  # of ones, for affine systems
         if matrix.shape != (rows, columns):
             raise ValueError(f"the file is damaged: {name} has shape {tuple(matrix.shape)}, not {(rows, columns)}.")
     recorded_as = None if tree["recorded_as"] is None else getattr(torch, tree["recorded_as"])

@@ -36,6 +36,7 @@ class GivenWeights(NamedTuple):
     lambda_s: Any
     lambda_u: Any
     R_du: Any
+    Q_terminal: Any
 
 
 class Settings(NamedTuple):
@@ -52,6 +53,7 @@ class Settings(NamedTuple):
     terminal_steps: int
     has_lambda_u: bool
     has_R_du: bool
+    affine: bool
     backward: str
     solver: str
 
@@ -72,6 +74,7 @@ class Settings(NamedTuple):
             held["terminal_steps"],
             _is_given("lambda_u", held),
             _is_given("R_du", held),
+            held["affine"],
             held["backward_system"],
             held["solver"],
         )
@@ -82,7 +85,7 @@ class Setup:
     """What follows from the settings of a layer.
 
     Attributes:
-        data: the recorded trajectories.
+        data: the recorded trajectories; for affine systems with a row of ones.
         terms: which terms the problem has beyond the paper's.
         sizes: the parts of theta and of v.
         sets: all sets of the problem as one.
@@ -109,13 +112,15 @@ class Setup:
         Raises:
             ValueError: settings that do not go together, or not with the data.
         """
-        data, steps = settings.data, settings.terminal_steps
+        data, steps = settings.data.with_ones if settings.affine else settings.data, settings.terminal_steps
+        if data.has_ones and not settings.affine:
+            raise ValueError("`affine` must be True for these data, which were saved by a layer with `affine=True`.")
         if not 0 <= steps <= data.horizon:
             raise ValueError(
                 f"`terminal_steps` must be an integer from 0 to the horizon, {data.horizon}, got {steps!r}."
             )
         rates = settings.has_R_du or settings.du_set is not None
-        terms = Terms(settings.regularizer == "identity", settings.has_lambda_u, rates, steps)
+        terms = Terms(settings.regularizer == "identity", settings.has_lambda_u, rates, steps, settings.affine)
         if terms.slack and terms.rates:
             raise ValueError("`R_du` and `du_set` count from the last u_ini, which `lambda_u` leaves open: give one.")
         named = [("u_set", settings.u_set[0], data.n_u), ("y_set", settings.y_set[0], data.n_y)]
@@ -168,6 +173,12 @@ def _steps(name: str, value: Any) -> int:
     return as_index(f"`{name}` must be an integer from 0 to the horizon", value)
 
 
+def _flag(name: str, value: Any) -> bool:
+    if not isinstance(value, bool):
+        raise ValueError(f"`{name}` must be True or False, got {value!r}.")
+    return value
+
+
 def _backward(_: str, value: Any) -> str:
     return check_choice("backward", value)
 
@@ -179,6 +190,7 @@ VALIDATORS: Mapping[str, Callable[[str, Any], Any]] = {
     "y_set": _set,
     "du_set": _set_or_none,
     "terminal_steps": _steps,
+    "affine": _flag,
     "regularizer": check_choice,
     "backward_system": _backward,
     "solver": check_choice,

@@ -38,7 +38,14 @@ def register(layer: nn.Module) -> int:
 
 
 def flat_parameters(
-    data: HankelData | HankelBatch, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any, batches: list[torch.Size]
+    data: HankelData | HankelBatch,
+    u_ini: Any,
+    y_ini: Any,
+    y_ref: Any,
+    u_ref: Any,
+    batches: list[torch.Size],
+    *,
+    affine: bool,
 ) -> tuple[Tensor, torch.dtype]:
     """Return (u_ini, y_ini, u_ref, y_ref) flattened, `(*batch, n_theta)`, and the dtype of the caller.
 
@@ -46,6 +53,7 @@ def flat_parameters(
         data: for the sizes.
         u_ini, y_ini, y_ref, u_ref: as for a call of the layer.
         batches: batch shapes that weights and data have.
+        affine: put a 1 before them, for affine systems.
     """
     u_ini = window("u_ini", u_ini, data.t_ini, data.n_u, "n_u")
     y_ini = window("y_ini", y_ini, data.t_ini, data.n_y, "n_y")
@@ -54,6 +62,8 @@ def flat_parameters(
     parts = [part.flatten(-2) for part in (u_ini, y_ini, u_ref, y_ref)]
     batch = torch.broadcast_shapes(*[part.shape[:-1] for part in parts], *batches)
     theta = torch.cat([part.expand(*batch, part.shape[-1]).double() for part in parts], dim=-1)
+    if affine:
+        theta = torch.cat([torch.ones_like(theta[..., :1]), theta], dim=-1)
     return theta, torch.promote_types(u_ini.dtype, y_ini.dtype)
 
 
@@ -72,8 +82,8 @@ def planned_by_operator(
 
 
 def batches_of(data: HankelData | HankelBatch, weights: tuple[Any, ...]) -> list[torch.Size]:
-    """Return the batch shapes of the data and of (Q, R, R_du, lambda_g, lambda_s, lambda_u)."""
-    tails = (2, 2, 2, 0, 0, 0)
+    """Return the batch shapes of the data and of (Q, R, R_du, lambda_g, lambda_s, lambda_u, Q_terminal)."""
+    tails = (2, 2, 2, 0, 0, 0, 2)
     found = [
         w.shape[: w.ndim - tail]
         for w, tail in zip(weights, tails, strict=True)
@@ -89,6 +99,6 @@ def described(layer: Any) -> tuple[str, list[Tensor]]:
         ValueError: the layer cannot be saved.
     """
     with _disable_current_modes():  # the recorded data are constants: nothing of their factorisation is traced
-        data = layer.data.compressed() if isinstance(layer.data, HankelData) else layer.data
+        data = compact_data(layer) if isinstance(layer.data, HankelData) else layer.data
     tree, tensors = layer_to_tree(layer, compact=data, live=True)
     return json.dumps({**tree, "order": list(tensors)}), list(tensors.values())

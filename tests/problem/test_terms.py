@@ -21,6 +21,10 @@ TERMS = {
     "two terminal steps": {"terminal_steps": 2},
     "identity, rate cost, terminal": {"regularizer": "identity", "R_du": 2.0, "terminal_steps": 1},
     "identity, slack, terminal": {"regularizer": "identity", "lambda_u": 5.0, "terminal_steps": 1},
+    "affine": {"affine": True},
+    "affine, identity, slack": {"affine": True, "regularizer": "identity", "lambda_u": 5.0},
+    "affine, rate cost, terminal": {"affine": True, "R_du": 2.0, "terminal_steps": 1},
+    "terminal weight": {"Q_terminal": torch.diag(torch.tensor([300.0, 200.0, 0.0, 5.0], dtype=torch.float64))},
 }
 
 
@@ -37,7 +41,8 @@ def by_hand(layer, options, u_ini, y_ini):
     """The unconstrained plan, built here from the data: minimise over g, with the equalities as they are."""
     data, h = layer.data, layer.data.horizon
     Up, Yp, Uf, Yf = data.matrices
-    W = torch.cat([Up, Yp, Uf])
+    ones = torch.ones(1, data.n_g, dtype=torch.float64)
+    W = torch.cat([Up, Yp, Uf, ones]) if "affine" in options else torch.cat([Up, Yp, Uf])
     eye = torch.eye(data.n_g, dtype=torch.float64)
     N = eye if options.get("regularizer") == "identity" else eye - torch.linalg.pinv(W) @ W
     rows, targets = [], []
@@ -47,7 +52,9 @@ def by_hand(layer, options, u_ini, y_ini):
         targets.append(weight @ target)
 
     charge(torch.eye(len(Uf)).double() * SMALL["R"] ** 0.5, Uf, U_REF.repeat(h))
-    charge(torch.eye(len(Yf)).double() * SMALL["Q"] ** 0.5, Yf, Y_REF.repeat(h))
+    Q = torch.full((h, 4), SMALL["Q"], dtype=torch.float64)
+    Q[-1] = options["Q_terminal"].diagonal() if "Q_terminal" in options else Q[-1]
+    charge(torch.diag(Q.flatten().sqrt()), Yf, Y_REF.repeat(h))
     charge(eye * (2 * SMALL["lambda_g"]) ** 0.5, N, torch.zeros(data.n_g, dtype=torch.float64))
     charge(torch.eye(len(Yp)).double() * (2 * SMALL["lambda_s"]) ** 0.5, Yp, y_ini.flatten())
     if "R_du" in options:
@@ -59,7 +66,7 @@ def by_hand(layer, options, u_ini, y_ini):
         target = torch.zeros(h, 2, dtype=torch.float64)
         target[0] = u_ini[-1]
         charge(torch.block_diag(*[root] * h), change.reshape(2 * h, -1), target.flatten())
-    held, values = [], []
+    held, values = ([ones], [ones[0, :1]]) if "affine" in options else ([], [])
     if "lambda_u" in options:
         charge(torch.eye(len(Up)).double() * (2 * options["lambda_u"]) ** 0.5, Up, u_ini.flatten())
     else:

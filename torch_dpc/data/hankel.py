@@ -234,6 +234,27 @@ class HankelData:
         """Singular values at or below this fraction of the largest count as zero."""
         return relative_tolerance(self.recorded_as or self.Up.dtype)
 
+    @property
+    def has_ones(self) -> bool:
+        """Whether Up has a row of ones before its own rows; see :attr:`with_ones`."""
+        return len(self.Up) > self.t_ini * self.n_u
+
+    @cached_property
+    def with_ones(self) -> HankelData:
+        """The same data with a row of ones before the rows of Up, for 1'g = 1.
+
+        Raises:
+            ValueError: the data are compact, and their factor has no such row.
+        """
+        if self.has_ones:
+            return self
+        if not self.has_windows:
+            raise ValueError(
+                "`affine=True` needs the recorded windows, and these data are compact: build the layer on "
+                "HankelData.from_trajectories."
+            )
+        return replace(self, Up=torch.cat([self.Up.new_ones(1, self.n_g), self.Up]))
+
     def compressed(self) -> HankelData:
         """Return the same data as `rank` columns, whatever the number of windows; plans are the same to the last bit.
 

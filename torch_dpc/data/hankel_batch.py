@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from functools import cached_property
 from typing import Any
 
 import torch
@@ -59,6 +60,16 @@ class HankelBatch:
     def matrices(self) -> tuple[Tensor, ...]:
         """The matrices of every data set."""
         return tuple(matrix for data in self.members for matrix in data.matrices)
+
+    @cached_property
+    def with_ones(self) -> HankelBatch:
+        """The same data sets, each with a row of ones; see :attr:`HankelData.with_ones`."""
+        return HankelBatch(data.with_ones for data in self.members)
+
+    @property
+    def has_ones(self) -> bool:
+        """Whether Up has a row of ones before its own rows."""
+        return any(data.has_ones for data in self.members)
 
     @property
     def n_g(self) -> int:

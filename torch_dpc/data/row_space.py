@@ -90,10 +90,11 @@ class RowSpace:
 def row_units(matrices: Sequence[Tensor], n_u: int, n_y: int, n_windows: int) -> Tensor:
     """Return the unit of each row of [Up; Yp; Uf; Yf], `(n_rows,)`, float64; arguments as of :meth:`RowSpace.of`."""
     Up, Yp, Uf, Yf = (m.detach().double() for m in matrices)
-    unit_u = _channel_units(torch.cat([Up, Uf]), n_u, n_windows)
+    unit_u = _channel_units(torch.cat([Up[-(len(Yp) // n_y) * n_u :], Uf]), n_u, n_windows)  # without a row of ones
     unit_y = _channel_units(torch.cat([Yp, Yf]), n_y, n_windows)
-    past, future = len(Up) // n_u, len(Uf) // n_u
-    return torch.cat([unit_u.repeat(past), unit_y.repeat(past), unit_u.repeat(future), unit_y.repeat(future)])
+    past, future = len(Yp) // n_y, len(Uf) // n_u
+    ones = unit_u.new_ones(len(Up) - past * n_u)
+    return torch.cat([ones, unit_u.repeat(past), unit_y.repeat(past), unit_u.repeat(future), unit_y.repeat(future)])
 
 
 def _channel_units(rows: Tensor, channels: int, n_windows: int) -> Tensor:

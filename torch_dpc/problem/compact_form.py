@@ -8,6 +8,7 @@ M = I - W^+ W,  W = [Up; Yp; Uf]
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import NamedTuple
 
 import torch
@@ -37,8 +38,9 @@ def projector(data: HankelData) -> Tensor:
 def compact_form(data: HankelData, weights: Weights, theta: Tensor, terms: Terms = Terms()) -> CompactForm:  # noqa: B008
     """Return P, q, H, b as the paper writes them, with what the problem has beyond the paper's.
 
-    A slack on u_ini moves Up from H to P, a weight on changes of the input widens R, and terminal steps are more rows
-    of H. A set of the changes is no part of z in D: it has no compact form.
+    For affine systems 1'g = 1 is the first row of H. A slack on u_ini moves Up from H to P, a weight on changes of the
+    input widens R, and terminal steps are more rows of H. A set of the changes is no part of z in D: it has no compact
+    form.
 
     Args:
         data: the recorded data.
@@ -50,7 +52,7 @@ def compact_form(data: HankelData, weights: Weights, theta: Tensor, terms: Terms
         P `(n, n)`, q `(*batch, n)`, H `(m, n)`, b `(*batch, m)` with n = horizon (n_u + n_y) + n_g and
         m = horizon (n_u + n_y) + t_ini n_u for the paper's terms.
     """
-    sizes = Sizes.of(data)
+    sizes = replace(Sizes.of(data, terms), du=0)
     Up, Yp, Uf, Yf = (m.detach().to(theta) for m in data.matrices)
     Q, R = weights.Q.to(theta), weights.R.to(theta)
     u_ini, y_ini, u_ref, y_ref = theta.split(sizes.theta, dim=-1)
@@ -63,17 +65,19 @@ def compact_form(data: HankelData, weights: Weights, theta: Tensor, terms: Terms
         change = change - torch.diag(change.new_ones(sizes.u - data.n_u), -data.n_u)
         before = torch.nn.functional.pad(u_ini[..., -data.n_u :], (0, sizes.u - data.n_u))
         R, q_u = R + change.T @ S @ change, q_u + before @ S @ change
+    n_ones = int(terms.affine)  # 1'g = 1 stands before the rows of Up, and has no slack
     if weights.lambda_u is not None:
-        of_g = of_g + 2 * weights.lambda_u * (Up.T @ Up)
-        q_g = q_g + 2 * weights.lambda_u * (u_ini @ Up)
+        of_g = of_g + 2 * weights.lambda_u * (Up[n_ones:].T @ Up[n_ones:])
+        q_g = q_g + 2 * weights.lambda_u * (u_ini[..., n_ones:] @ Up[n_ones:])
     P = torch.block_diag(R, Q, of_g)
     q = -torch.cat([q_u, y_ref @ Q, q_g], dim=-1)
     n_v = sizes.u + sizes.y
     eye = torch.eye(n_v, dtype=theta.dtype, device=theta.device)
     H, b = [torch.cat([-eye, torch.cat([Uf, Yf])], dim=1)], [theta.new_zeros(*theta.shape[:-1], n_v)]
-    if not terms.slack:
-        H.insert(0, torch.cat([Up.new_zeros(sizes.u_ini, n_v), Up], dim=1))
-        b.insert(0, u_ini)
+    exact = n_ones if terms.slack else sizes.u_ini
+    if exact:
+        H.insert(0, torch.cat([Up.new_zeros(exact, n_v), Up[:exact]], dim=1))
+        b.insert(0, u_ini[..., :exact])
     if terms.terminal_steps:
         last = terms.terminal_steps * data.n_y
         H.append(torch.cat([eye[-last:], eye.new_zeros(last, data.n_g)], dim=1))

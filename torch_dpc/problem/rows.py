@@ -165,7 +165,10 @@ class DataRows:
             tracking.append(Tracking("R_du", slice(n_v, n_v + len(Uf)), None))
         equal, places = [], []
         if terms.slack:
-            fits.append(Fit("lambda_u", Up, 0))
+            fits.append(Fit("lambda_u", Up[int(terms.affine) :], int(terms.affine)))
+            if terms.affine:  # 1'g = 1 has no slack
+                equal.append(Up[:1])
+                places.append(torch.arange(1))
         else:
             equal.append(Up)
             places.append(torch.arange(len(Up)))

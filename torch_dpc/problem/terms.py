@@ -21,18 +21,21 @@ class Terms:
         slack: lambda_u |Up g - u_ini|^2 in place of Up g = u_ini.
         rates: the changes of the input, u_t - u_(t-1), are constrained or charged.
         terminal_steps: so many last outputs equal their reference.
+        affine: 1'g = 1, one more row of Up before the others.
     """
 
     identity: bool = False
     slack: bool = False
     rates: bool = False
     terminal_steps: int = 0
+    affine: bool = False
 
 
 @dataclass(frozen=True)
 class Sizes:
     """How many entries each part of theta = (u_ini, y_ini, u_ref, y_ref) and of v = (u, y, du) has, and how many steps.
 
+    For affine systems a 1 stands before u_ini in theta, for 1'g = 1.
     du, the changes of the input, has entries only where the problem speaks of them.
     """
 
@@ -48,7 +51,14 @@ class Sizes:
         """Read the sizes off the data."""
         past, future = data.t_ini, data.horizon
         n_u, n_y = data.n_u, data.n_y
-        return Sizes(past * n_u, past * n_y, future * n_u, future * n_y, future, future * n_u if terms.rates else 0)
+        return Sizes(
+            past * n_u + terms.affine,
+            past * n_y,
+            future * n_u,
+            future * n_y,
+            future,
+            future * n_u if terms.rates else 0,
+        )
 
     @property
     def v(self) -> int:

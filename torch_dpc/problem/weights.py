@@ -95,6 +95,23 @@ def weight_matrix(name: str, value: Any, channels: int, horizon: int) -> Tensor:
     return torch.einsum("st,...ij->...sitj", steps, matrix).reshape(*matrix.shape[:-2], size, size)
 
 
+def output_weight(Q: Any, Q_terminal: Any, n_y: int, horizon: int) -> Tensor:
+    """Return Q of the whole horizon, with Q_terminal, `(..., n_y, n_y)`, in place of that of the last step if given.
+
+    Raises:
+        ValueError: as :func:`weight_matrix`.
+    """
+    whole = weight_matrix("Q", Q, n_y, horizon)
+    if Q_terminal is None:
+        return whole
+    last = weight_matrix("Q_terminal", Q_terminal, n_y, 1)
+    before = (horizon - 1) * n_y
+    batch = torch.broadcast_shapes(whole.shape[:-2], last.shape[:-2])
+    rest, last = whole[..., :before, :before].expand(*batch, -1, -1), last.expand(*batch, -1, -1)
+    side = whole.new_zeros(*batch, before, n_y)
+    return torch.cat([torch.cat([rest, side], -1), torch.cat([side.mT, last.to(whole)], -1)], -2)
+
+
 def _smallest_eigenvalue(matrix: Tensor) -> Tensor:
     """Return the smallest eigenvalue of a symmetric matrix of any batch, brought to a unit diagonal."""
     diagonal = matrix.diagonal(dim1=-2, dim2=-1)
