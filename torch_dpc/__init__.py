@@ -18,6 +18,7 @@ from .attacks import (
 )
 from .control.controller import DPCController
 from .control.log import ClosedLoopLog
+from .control.nearest import NearestWindows
 from .control.simulation import simulate
 from .data.hankel import HankelData, excitation_order, hankel
 from .data.hankel_batch import HankelBatch
@@ -50,6 +51,7 @@ __all__ = [
     "HankelStream",
     "InfeasibleError",
     "L1BallBudget",
+    "NearestWindows",
     "NonNegative",
     "PerChannelBudget",
     "PerSampleBudget",

@@ -13,9 +13,10 @@ from ..checks import as_data, as_index, check_number, check_type
 from ..errors import Status
 from ..layer import DPCLayer
 from ..solution import DPCSolution
+from .nearest import NearestWindows
 from .past import Past
 from .plan_times import PlanTimes
-from .soften import plan_softened
+from .soften import plan_softened, require_boxes
 
 
 @dataclass(frozen=True, eq=False)
@@ -45,7 +46,7 @@ class DPCController:
     :meth:`step` is given the windows; :meth:`act` keeps them itself, for a loop around hardware.
 
     Args:
-        layer: the planning problem.
+        layer: the planning problem, or :class:`torch_dpc.control.nearest.NearestWindows` around it.
         replan_every: steps of a plan that are applied before the next one, at most the horizon; by default 10, or the
             horizon where that is shorter.
         on_failure: what to do when the problem has no solution:
@@ -76,7 +77,7 @@ class DPCController:
 
     def __init__(
         self,
-        layer: DPCLayer,
+        layer: DPCLayer | NearestWindows,
         replan_every: int | None = None,
         *,
         on_failure: str = "raise",
@@ -96,8 +97,8 @@ class DPCController:
             raise ValueError(f'`on_failure` must be "raise", "hold" or "soften", got {on_failure!r}.')
         if on_alarm not in ("ignore", "hold"):
             raise ValueError(f'`on_alarm` must be "ignore" or "hold", got {on_alarm!r}.')
-        if on_failure == "soften" and not layer.feasible_set.is_box:
-            raise ValueError('`on_failure="soften"` widens boxes; give the layer a SoftBox as `y_set` instead.')
+        if on_failure == "soften":
+            require_boxes(layer)
         check_number("soft_weight", soft_weight, positive=True, kind="positive and finite")
         self.layer = layer
         self.replan_every = replan_every
@@ -204,8 +205,7 @@ class DPCController:
         widths: float | Tensor = 0.0 if status.ndim == 0 else torch.zeros(status.shape, dtype=torch.float64)
         if not bool(solved.all()):
             if self.on_failure == "soften":
-                theta, _ = self.layer.flatten(u_ini, y_ini, y_ref, u_ref)
-                inputs, widths = self._softened(theta, plan.u, ~solved)
+                inputs, widths = self._softened((u_ini, y_ini, y_ref, u_ref), plan.u, ~solved)
             else:
                 inputs = torch.where(solved[..., None, None], inputs, self._rest(plan.u))
         if self.on_alarm == "hold" and alarm is not None and bool(alarm.any()):
@@ -223,8 +223,10 @@ class DPCController:
         held = inputs[..., -1:, :].expand(*inputs.shape[:-2], age, -1)
         return torch.cat([inputs[..., age:, :], held], dim=-2)
 
-    def _softened(self, theta: Tensor, inputs: Tensor, failed: Tensor) -> tuple[Tensor, float | Tensor]:
+    def _softened(self, call: tuple[Any, ...], inputs: Tensor, failed: Tensor) -> tuple[Tensor, float | Tensor]:
         """Return the inputs with those of failed samples planned anew under softened output bounds, and the widths."""
+        assert isinstance(self.layer, DPCLayer)
+        theta, _ = self.layer.flatten(*call)
         if failed.ndim == 0:
             softened, width = plan_softened(self.layer, theta, self.soft_weight)
             return softened.u.to(inputs.dtype), width

@@ -9,6 +9,8 @@ falls below the weight, and a section search finds it, many widths at once as on
 
 from __future__ import annotations
 
+from typing import Any
+
 import torch
 from torch import Tensor
 
@@ -19,6 +21,16 @@ from ..solution import DPCSolution
 #: Widths tried at once, and rounds of narrowing: t is found to (SECTIONS - 1)^-ROUNDS of its scale.
 SECTIONS = 16
 ROUNDS = 12
+
+
+def require_boxes(planner: Any) -> None:
+    """Raise ValueError unless a planner is a layer whose sets are boxes."""
+    if not isinstance(planner, DPCLayer):
+        raise ValueError(f'`on_failure="soften"` needs a DPCLayer, got {type(planner).__name__}.')
+    try:
+        planner.bounds(torch.device("cpu"))
+    except ValueError as error:
+        raise ValueError('`on_failure="soften"` widens boxes; give the layer a SoftBox as `y_set` instead.') from error
 
 
 def plan_softened(layer: DPCLayer, theta: Tensor, weight: float) -> tuple[DPCSolution, float]:
