@@ -19,7 +19,7 @@ from torch.utils._python_dispatch import _disable_current_modes
 from .checks import reference, window
 from .data.hankel import HankelData
 from .data.hankel_batch import HankelBatch
-from .saving import layer_to_tree
+from .saving import compact_data, layer_to_tree
 from .solution import DPCSolution, SolveInfo, lost
 from .solve.recovery import Thunks
 
