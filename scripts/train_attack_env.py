@@ -114,7 +114,9 @@ def train(env: AttackEnv, seed: int) -> tuple[Policy, list[float]]:
 
 def judge(env: AttackEnv, policy: Policy) -> dict[str, np.ndarray[Any, Any]]:
     """Return the costs psi of held-out episodes, summed over each, by attack."""
-    attack, noise = attacks.LinearizedAttack(env.controller.layer, env.cost, env.budget), np.random.default_rng(7)
+    layer = env.controller.layer
+    assert isinstance(layer, dpc.DPCLayer)
+    attack, noise = attacks.LinearizedAttack(layer, env.cost, env.budget), np.random.default_rng(7)
 
     def algorithm_1(env: AttackEnv, _: Any) -> np.ndarray[Any, Any]:
         u_ini, y_ini, references = env.window()

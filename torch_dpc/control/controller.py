@@ -85,7 +85,7 @@ class DPCController:
         soft_weight: float = 1e6,
         deadline: float | None = None,
     ):
-        check_type("layer", layer, DPCLayer)
+        check_type("layer", layer, (DPCLayer, NearestWindows))
         horizon = layer.data.horizon
         if replan_every is None:
             replan_every = min(10, horizon)

@@ -81,6 +81,8 @@ class HankelData:
             check_type(name, matrix, Tensor)
             as_data(name, matrix)
             steps, channels = ("t_ini" if name[1] == "p" else "horizon"), f"n_{name[0].lower()}"
+            if name == "Up" and self.has_ones and (self.windows_seen is not None or bool((matrix[0] == 1).all())):
+                matrix = matrix[1:]  # the row of ones of `with_ones`
             if matrix.shape != (sizes[steps] * sizes[channels], columns):
                 wanted = f"({steps} {channels}, n_g) = ({sizes[steps] * sizes[channels]}, {columns})"
                 raise ValueError(f"`{name}` must have shape {wanted}, got {tuple(matrix.shape)}.")
