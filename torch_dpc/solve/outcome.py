@@ -21,10 +21,12 @@ class Acceptance:
     Attributes:
         residual: largest residual of an accepted sample (:mod:`torch_dpc.solve.optimality`).
         convincing: residual above which a sample gets a second look in extended precision.
+        of_selection: largest amount by which the best g may miss a plan that moved along the kernel of the cost.
     """
 
     residual: float = 1e-8
     convincing: float = 1e-9
+    of_selection: float = 1e-7
 
 
 ACCEPTANCE = Acceptance()

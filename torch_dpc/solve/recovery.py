@@ -16,8 +16,9 @@ from ..data.hankel_batch import HankelBatch
 from ..errors import Status
 from ..problem.cost import mismatch, optimal_cost
 from ..problem.reduction import Reduction
+from .consistency import rounding_of
 from .engines import Sets
-from .outcome import ACCEPTANCE, Planned, joined
+from .outcome import Planned, joined
 from .solver import Solver
 
 #: The results that a plan computes when asked.
@@ -120,44 +121,16 @@ class Recovery:
         self.data.require_windows()
         reduction = self.reduction
         a = times(reduction.A_theta, self.theta) - times(reduction.A_lam, self.planned.lam)
-        a = a + self._rounding_of(a)
+        with torch.no_grad():
+            v = torch.cat([x.detach().flatten(-2) for x in (self.planned.u, self.planned.y)], dim=-1)
+            rounding = rounding_of(reduction.detach(), self.theta.detach(), a.detach(), v)
+        a = a + rounding
         basis = self.data.basis.to(a.device)
         if not carries_derivative((reduction.rows.C,)):
             return times(basis, a)
         # g = D^+ (D g), so that the data behind D are differentiated too; D in units, which g does not see.
         D = self.data.stacked.to(a.device) / reduction.rows.theta_scale[..., None]
         return times(torch.linalg.pinv(D, rtol=reduction.rows.tolerance), times(D @ basis, a))
-
-    def _rounding_of(self, a: Tensor) -> Tensor:
-        """Return the change of a that brings Uf g and Yf g onto u and y, where they differ by more than is accepted.
-
-        Large multipliers round g by more than they round the plan. Where the cost has a kernel the plan may have moved
-        along it: that comes first, for it changes no cost; the rest changes the cost by as little as can be.
-        """
-        with torch.no_grad():
-            reduction, a = self.reduction.detach(), a.detach()
-            v = torch.cat([x.detach().flatten(-2) for x in (self.planned.u, self.planned.y)], dim=-1)
-            n = v.shape[-1]
-            per = 1 / reduction.scale[..., :n]
-            C = reduction.rows.C[..., :n, :]
-            rows, theta = reduction.rows, self.theta.detach()
-            change = times(rows.Eq_pinv, theta[..., rows.Eq_theta] - times(rows.Eq, a))
-            change = torch.where(reduction.rows.unreachable(theta)[..., None], 0.0, change)
-            missed = torch.nan_to_num((v - times(C, a + change)) * per)
-            if reduction.is_selection:
-                K = reduction.kernel_in_a  # what large multipliers leave along it is rounding; w follows from the plan
-                change = change - times(K, times(K.mT, a + change))
-                missed = torch.nan_to_num((v - times(C, a + change)) * per)
-                change = change + times(K, _solved(reduction.kernel[..., :n, :] * per[..., None], missed))
-                missed = torch.nan_to_num((v - times(C, a + change)) * per)
-            T_inverse = torch.linalg.inv(reduction.T)
-            back, Ct = reduction.Z @ T_inverse, reduction.Ct[..., :n, :]
-            if reduction.is_selection:  # off the kernel, whose small charge would hide all else
-                along = reduction.kernel_in_a.mT @ back
-                Ct, back = Ct - reduction.kernel[..., :n, :] @ along, back - reduction.kernel_in_a @ along
-            x = _solved(Ct * per[..., None], missed)
-            is_off = (missed.abs() / (1 + (v * per).abs())).amax(-1, keepdim=True) > ACCEPTANCE.residual
-            return change + torch.where(is_off, times(back, x), 0.0)
 
     def _value(self) -> Tensor:
         planned = self.planned
@@ -177,8 +150,3 @@ class Recovery:
             fixed = (reduction.weights.lambda_g > 0) | self.data.spans_all.to(self.theta.device)
             decided = reduction.rows.Eq_range is None and not self.reduction.is_selection
             return self.solver.independent(self.planned, self.sets) & fixed & decided
-
-
-def _solved(matrix: Tensor, missed: Tensor) -> Tensor:
-    """Return the least x with matrix x = missed, as far as there is one."""
-    return times(torch.linalg.pinv(matrix, rtol=1e-13), missed)

@@ -27,6 +27,7 @@ from . import kernels
 from .active_set import solve_active
 from .certificate import is_infeasible
 from .compiled import CompiledPlanner
+from .consistency import inconsistency
 from .engines import Engines, Sets
 from .kernels import PlannedArrays
 from .optimality import BATCHED, Optimality
@@ -201,6 +202,10 @@ class Solver:
         doubtful = ~(solved.info[..., 2] <= ACCEPTANCE.convincing)
         if bool(doubtful.any()):
             self._look_again(solved, theta, moved, sets, doubtful)
+        if self.reduction.is_selection:
+            missed = inconsistency(self.reduction, theta, solved.lam, solved.v)
+            solved.info[..., 0][~(missed <= ACCEPTANCE.of_selection)] = int(Status.FAILED)
+            solved.info[..., 2] = torch.maximum(solved.info[..., 2], missed)
         solved.info[..., 0][self.reduction.rows.unreachable(theta)] = int(Status.FAILED)
         return solved, found.gap
 

@@ -1,0 +1,59 @@
+"""The coefficients a of g = B a that reproduce a plan.
+
+a = A_theta theta - A_lam lam, but large multipliers round a by more than they round the plan, and where the cost has a
+kernel the plan may have moved along it. Both are made good here, and what cannot be made good is measured.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from ..batching import times
+from ..problem.reduction import Reduction
+from .outcome import ACCEPTANCE
+
+#: Singular values at or below this fraction of the largest are no direction to correct along.
+NO_DIRECTION = 1e-13
+
+
+def rounding_of(reduction: Reduction, theta: Tensor, a: Tensor, v: Tensor) -> Tensor:
+    """Return the change of a that brings Up g, Uf g and Yf g onto u_ini, u and y, `(*batch, r)`.
+
+    The kernel of the cost comes first, for moving along it changes no cost. The rest, which changes the cost by as
+    little as can be, is done where the plan is missed by more than is accepted.
+
+    Args:
+        reduction: without a graph.
+        theta: (u_ini, y_ini, u_ref, y_ref), `(*batch, n_theta)`.
+        a: the coefficients, `(*batch, r)`.
+        v: the plan, `(*batch, n)`: (u, y), du left out or not.
+    """
+    rows, n = reduction.rows, v.shape[-1]
+    per = 1 / reduction.scale[..., :n]
+    C, kernel, K = rows.C[..., :n, :], reduction.kernel[..., :n, :], reduction.kernel_in_a
+    change = times(rows.Eq_pinv, theta[..., rows.Eq_theta] - times(rows.Eq, a))
+    change = torch.where(rows.unreachable(theta)[..., None], 0.0, change)
+    back, Ct = reduction.Z @ torch.linalg.inv(reduction.T), reduction.Ct[..., :n, :]
+    if reduction.is_selection:
+        # What large multipliers leave along the kernel is rounding: w follows from the plan.
+        change = change - times(K, times(K.mT, a + change))
+        change = change + times(K, _solved(kernel * per[..., None], torch.nan_to_num((v - times(C, a + change)) * per)))
+        along = K.mT @ back
+        Ct, back = Ct - kernel @ along, back - K @ along  # the small charge of the kernel would hide all else
+    missed = torch.nan_to_num((v - times(C, a + change)) * per)
+    is_off = (missed.abs() / (1 + (v * per).abs())).amax(-1, keepdim=True) > ACCEPTANCE.residual
+    return change + torch.where(is_off, times(back, _solved(Ct * per[..., None], missed)), 0.0)
+
+
+def inconsistency(reduction: Reduction, theta: Tensor, lam: Tensor, v: Tensor) -> Tensor:
+    """Return by how much the best g misses the plan v `(*batch, N)`, relative to each row's unit, `(*batch,)`."""
+    a = times(reduction.A_theta, theta) - times(reduction.A_lam, lam)
+    a = a + rounding_of(reduction, theta, a, v)
+    missed = (v - times(reduction.rows.C, a)) / reduction.scale
+    return (missed.abs() / (1 + (v / reduction.scale).abs())).amax(-1)
+
+
+def _solved(matrix: Tensor, missed: Tensor) -> Tensor:
+    """Return the least x with matrix x = missed, as far as there is one."""
+    return times(torch.linalg.pinv(matrix, rtol=NO_DIRECTION), missed)
