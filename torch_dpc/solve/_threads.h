@@ -35,7 +35,7 @@ typedef void Work(const Batch *, Workspace *, int64_t from, int64_t to);
     FOR_SAMPLES(adjoint_##instructions, adjoint_sample, attribute)
 
 ENTRY_POINTS(any, )
-#if defined(__x86_64__)
+#if defined(__x86_64__) && !defined(TORCH_DPC_PLAIN)
 ENTRY_POINTS(avx2, __attribute__((target("avx2,fma"))))
 #endif
 
@@ -45,7 +45,7 @@ static Work *solve_active_work = solve_active_any, *adjoint_work = adjoint_any;
 static const char *instructions = "any";
 
 static void choose_instructions(void) {
-#if defined(__x86_64__)
+#if defined(__x86_64__) && !defined(TORCH_DPC_PLAIN)
     __builtin_cpu_init();
     if (!__builtin_cpu_supports("avx2") || !__builtin_cpu_supports("fma")) return;
     solve_work = solve_avx2, solve_held_work = solve_held_avx2, judge_work = judge_avx2;

@@ -7,8 +7,13 @@
 #include <stdint.h>
 #include <string.h>
 
-/* Functions on the inner path are inlined, so that each is compiled for the vector instructions of its caller. */
+/* Functions on the inner path are inlined, so that each is compiled for the vector instructions of its caller.
+ * TORCH_DPC_PLAIN leaves that, and all but the common instructions, to a build that has to be quick to compile. */
+#ifdef TORCH_DPC_PLAIN
+#define INLINE static
+#else
 #define INLINE static inline __attribute__((always_inline))
+#endif
 
 enum { WIDTH = 4, BLOCK = 4 * WIDTH }; /* numbers in a vector, and in the blocks of columns that a loop works on */
 typedef double vec __attribute__((vector_size(4 * sizeof(double))));
