@@ -28,7 +28,8 @@ from .layer import DPCLayer
 from .problem.compact_form import CompactForm
 from .saving import register_set
 from .sets import Ball, Box, ConvexSet, NonNegative, Product, Reals, SecondOrderCone, SoftBox
-from .solution import DPCSolution, SolveInfo
+from .solution import DPCSolution
+from .solve.info import SolveInfo
 from .systems.plant import Plant, collect
 
 __version__ = "0.1.0"

@@ -20,7 +20,8 @@ from .checks import reference, window
 from .data.hankel import HankelData
 from .data.hankel_batch import HankelBatch
 from .saving import compact_data, layer_to_tree
-from .solution import DPCSolution, SolveInfo, lost
+from .solution import DPCSolution
+from .solve.info import SolveInfo, lost
 from .solve.recovery import Thunks
 
 #: The layers of this process; compiled models find them by their handles.

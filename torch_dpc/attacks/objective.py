@@ -12,7 +12,8 @@ from torch import Tensor
 from ..checks import as_data, check_type, last_rows, to_horizon
 from ..errors import Status
 from ..layer import DPCLayer
-from ..solution import DPCSolution, SolveInfo
+from ..solution import DPCSolution
+from ..solve.info import SolveInfo
 from ..solve.recovery import NAMES, Thunks
 from .base import Planner
 from .costs import bound

@@ -248,7 +248,7 @@ def identity_key(owner: ConvexSet) -> tuple[Any, ...]:
     if not held["_modules"]:
         return owner, held.get("per")
     channels = [list(own) for own in owner.channels] if isinstance(owner, Product) else None
-    return owner, held.get("per"), channels, [identity_key(inner) for inner in owner.children()]  # type: ignore[arg-type]
+    return owner, held.get("per"), channels, [identity_key(cast(ConvexSet, inner)) for inner in owner.children()]
 
 
 def _is_box(owner: ConvexSet) -> bool:
