@@ -9,7 +9,8 @@ same iterations, vehicles, starts and steps of the optimiser. Judged on held-out
 random noise and Algorithm 1; the same commands given to `TorchQuadrotor` say how far the twin is off under attack. A
 run that was killed goes on from its last checkpoint. Leaves, in results/:
 
-    study_twin.csv, .md             every lap, and the table
+    study_twin.csv, .md             every lap, and the tables
+    study_twin_signal.csv           a signal that foresees the run on the twin (`SignalAttack`), replayed to PyBullet
     study_twin_{model}.safetensors  the networks
 """
 
@@ -41,6 +42,7 @@ RATE = {"imitate": 3e-3, "loop": 5e-3}  # of Adam
 LARGEST_GRADIENT = 1.0
 HIDDEN = (16,)
 MODELS = ("linear model", "twin")
+SIGNAL = {"flown": 100, "plans": 2, "steps": 6}  # steps of each lap, plans looked ahead, gradient steps at each plan
 
 
 class LinearTwin(QuadrotorTwin):
@@ -118,6 +120,33 @@ def judge(seed: int, paths: dict[str, Path]) -> list[dict[str, Any]]:
     return rows
 
 
+def signals(seeds: int, paths: dict[str, Path]) -> list[dict[str, Any]]:
+    """Return a row for each attack on the first steps of the held-out laps, at the largest rho, in PyBullet.
+
+    The signal attack foresees the run on the twin, all laps at once; what it reported is then replayed to PyBullet.
+    """
+    case = QuadrotorTwin()
+    layer, steps = case.planner(TRAINING), SIGNAL["flown"]
+    starts = torch.cat([case.starts(1, HELD_OUT + seed) for seed in range(seeds)])
+    vehicles, controller = case.vehicles(), dpc.DPCController(layer, case.replan_every, on_failure="hold")
+    error, budget = attacks.RunError(case.channels), attacks.RelativeBallBudget(case.rho)
+    plans, walk = SIGNAL["plans"], SIGNAL["steps"]
+    attack = attacks.SignalAttack(vehicles, controller, error, budget, plans=plans, steps=walk)
+    foreseen = case.fly(layer, attack, starts, steps, vehicles=vehicles).p.detach()
+
+    rows = []
+    for seed, start in enumerate(starts.tolist()):
+
+        def replayed(u_ini: Tensor, y_ini: Tensor, *, step: int, seed: int = seed, **_: Any) -> Tensor:
+            return foreseen[seed, min(step, steps - 1)]
+
+        chosen = {name: one for name, rho, one in contenders(layer, case, paths) if rho in (0.0, case.rho)}
+        for name, one in {**chosen, "signal": replayed}.items():
+            log, _ = fly_lap(case, layer, one, start, torch.Generator().manual_seed(seed))
+            rows.append({"seed": seed, "attack": name, "error": float(case.error(log)[:steps].mean())})
+    return rows
+
+
 def largest_gap(rows: list[dict[str, Any]]) -> float:
     """Return how far the twin is from PyBullet under the same commands [m], laps that ended in a crash left out."""
     flown = [row for row in rows if not row["crashed"]]
@@ -146,6 +175,19 @@ def table(rows: dict[str, Any], rhos: tuple[float, ...], seconds: dict[str, floa
     return "\n\n".join([*lines, "\n".join(cells), end]) + "\n"
 
 
+def signal_table(rows: list[dict[str, Any]]) -> str:
+    """Return the table of the signal attack in Markdown."""
+    lines = [
+        f"First {SIGNAL['flown']} steps of the laps, at the largest rho, in PyBullet [m].\n",
+        "| attack | mean (least to largest) |",
+        "|---|---|",
+    ]
+    for name in dict.fromkeys(row["attack"] for row in rows):
+        errors = [row["error"] for row in rows if row["attack"] == name]
+        lines.append(f"| {name} | {sum(errors) / len(errors):.3f} ({min(errors):.3f} to {max(errors):.3f}) |")
+    return "\n".join(lines) + "\n"
+
+
 def main(argv: list[str] | None = None) -> None:
     parser = arguments(__doc__, seeds=6)
     parser.add_argument("--quick", action="store_true", help="a few iterations and vehicles, to see that it works")
@@ -165,6 +207,9 @@ def main(argv: list[str] | None = None) -> None:
     kept = ("seed", "attack", "rho", "error", "crashed")
     write_rows(out / "study_twin.csv", [{key: row[key] for key in kept} for lap in laps for row in lap], note)
     text = table(read_rows(out / "study_twin.csv"), QuadrotorTwin().rhos, seconds, gap, note)
+    foreseen = signals(args.seeds, paths)
+    write_rows(out / "study_twin_signal.csv", foreseen, note)
+    text = f"{text}\n{signal_table(foreseen)}"
     (out / "study_twin.md").write_text(text)
     print(text)
 

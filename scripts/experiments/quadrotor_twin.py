@@ -29,13 +29,15 @@ class QuadrotorTwin(Quadrotor):
         """Return the plant; a vehicle that touches the ground stays there."""
         return dpc.systems.TorchQuadrotor(self.physics_hz, ground="stop")
 
-    def fly(self, layer: dpc.DPCLayer, attack: Any, starts: Tensor, steps: int, **options: Any) -> dpc.ClosedLoopLog:
+    def fly(
+        self, layer: dpc.DPCLayer, attack: Any, starts: Tensor, steps: int, *, vehicles: Any = None, **options: Any
+    ) -> dpc.ClosedLoopLog:
         """Return the log of runs from rest at some steps of the circle, all at once; crashed vehicles stay there."""
         circle = self.circle(self.lap + steps + self.horizon)
         references = circle[starts[:, None] + torch.arange(steps + self.horizon)]
         controller = dpc.DPCController(layer, self.replan_every, on_failure="hold")
         run = {"steps": steps, "attack": attack, "reset": {"position": references[:, 0, :3]}, **options}
-        return dpc.simulate(self.vehicles(), controller, references, **run)
+        return dpc.simulate(vehicles or self.vehicles(), controller, references, **run)
 
     def replay(self, position: Tensor, commands: Tensor) -> Tensor:
         """Return the outputs, `(runs, steps, 6)`, of given commands `(runs, steps, 3)` from rest at a position."""
