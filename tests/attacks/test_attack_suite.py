@@ -15,7 +15,7 @@ from helpers import HOLDING, Y_REF, generator, paper_layer, randn, relative, sma
 from recordings import quadrotor_recording
 from torch_dpc import attacks
 from torch_dpc.attacks.base import within_budget
-from torch_dpc.attacks.loop import SETTINGS
+from torch_dpc.attacks.loop import SETTINGS, Walk
 from torch_dpc.attacks.objective import psi_and_gradient
 
 EXACT = 1e-10
@@ -240,6 +240,24 @@ def test_cut_off_after_its_first_step_the_loop_is_algorithm_1():
     first = attacks.LinearizedAttack(*problem)(u_ini, y_ini, **refs)
     for make in (attacks.ProjectedGradientAttack, attacks.FrankWolfeAttack):
         assert torch.equal(make(*problem, steps=0)(u_ini, y_ini, **refs), first)
+
+
+def test_steps_are_those_of_the_textbook():
+    """Frank-Wolfe goes 2 / (k + 2) of the way to the vertex; momentum adds to what is left of the last direction."""
+    layer, y_ini = small_layer(), randn(5, 3, 4)
+    problem = (layer, attacks.TargetInput(HOLDING), attacks.BallBudget(0.1))
+    walk, vertex = Walk.at(randn(5, 3, 4, seed=1)), randn(5, 3, 4, seed=2)
+    for k in (0, 1, 4):
+        step = attacks.FrankWolfeAttack(*problem)._direction(walk, vertex, y_ini, k)
+        torch.testing.assert_close(step, 2 / (k + 2) * (vertex - walk.p))
+    momentum = attacks.ProjectedGradientAttack(*problem, momentum=0.5)
+    walk.gradient, walk.velocity = randn(5, 3, 4, seed=3), randn(5, 3, 4, seed=4)
+    unit = walk.gradient / walk.gradient.norm(dim=(-2, -1), keepdim=True)
+    kept = 0.5 * walk.velocity + unit
+    step = momentum._direction(walk, vertex, y_ini, 0)
+    torch.testing.assert_close(walk.velocity, kept)
+    length = 0.5 * 1.5 * 0.1  # the step size, longer after a success, times the budget
+    torch.testing.assert_close(step, -length * kept / kept.norm(dim=(-2, -1), keepdim=True))
 
 
 def test_restarts_repeat_by_their_generator_and_never_hurt():

@@ -21,6 +21,7 @@ from helpers import (
 )
 from recordings import quadrotor_recording
 from torch_dpc import attacks
+from torch_dpc.attacks.base import AttackCall
 
 EXACT = 1e-9  # of the noise-free predictor: its recording has a condition of 1e5
 INSIDE = 1e-9
@@ -244,6 +245,17 @@ def test_finite_differences_give_algorithm_1_away_from_kinks():
     assert asking.n_queries == 4 * (1 + 2 * 12 + 1)  # at zero, around it, and the answer
     asking(u_ini[0], y_ini[0], y_ref=Y_REF)
     assert asking.n_queries == 5 * 26
+
+
+def test_the_slope_by_queries_is_the_slope():
+    """Algorithm 1 looks at the direction alone: the size of the slope counts where psi and its slope are compared."""
+    layer, cost, budget = problem()
+    u_ini, y_ini = windows(4, 3, seed=2)
+    call = AttackCall(u_ini, y_ini, Y_REF, None, None, 0)
+    p = torch.zeros_like(y_ini)
+    psi, slope = attacks.FiniteDifferenceAttack(layer, cost, budget)._objective(call).gradient(p)
+    right = attacks.ProjectedGradientAttack(layer, cost, budget)._objective(call).gradient(p)
+    assert relative(psi, right[0]) < DIFFERENCES and relative(slope, right[1]) < DIFFERENCES
 
 
 def test_random_directions_are_cheaper_and_rougher():

@@ -107,6 +107,18 @@ def test_the_attack_is_on_the_measurement_alone():
             torch.testing.assert_close(controller.told[k][1], true_y + log.p[k])
 
 
+def test_what_reaches_the_plant_is_what_was_planned():
+    """An attack changes the plans, and through them the inputs; it adds nothing to an input by itself."""
+    plant, controller = Recorder(), SpyController(small_layer(), replan_every=3)
+    log = dpc.simulate(plant, controller, Y_REF, steps=7, attack=add_one)
+    assert log.p.abs().min() > 0 and torch.equal(torch.stack(plant.inputs[-7:]), log.u)
+    controller.reset()
+    u_ini = torch.stack(plant.inputs[:T_INI])
+    y_ini = 0.01 * torch.arange(T_INI, dtype=torch.float64)[:, None].expand(-1, 4)
+    plan = controller.layer(u_ini, y_ini + log.p[0], y_ref=Y_REF)
+    torch.testing.assert_close(torch.stack(plant.inputs[T_INI : T_INI + 3]), plan.u[:3], rtol=0, atol=EXACT)
+
+
 def test_the_attack_sees_the_truth_and_the_references_of_its_step():
     seen = []
 

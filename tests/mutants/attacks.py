@@ -76,14 +76,14 @@ MUTANTS = [
         GRADIENT,
         "return 2 / (k + 2) * (vertex - walk.p)",
         "return 1 / (k + 2) * (vertex - walk.p)",
-        SUITE + " -k trust_region or bounded or never_worse",
+        SUITE + " -k textbook or trust_region",
     ),
     M(
         "momentum forgets",
         GRADIENT,
         "velocity = self.momentum * walk.velocity + direction(walk.gradient)",
         "velocity = direction(walk.gradient)",
-        SUITE + " -k trust_region or bounded or never_worse",
+        SUITE + " -k textbook or trust_region",
     ),
     M(
         "box budget of half the size",
@@ -97,7 +97,7 @@ MUTANTS = [
         ENTRIES,
         "return -scale * direction(scale * c)",
         "return -scale * direction(c)",
-        BUDGETS + " -k no_admissible",
+        BUDGETS,
     ),
     M(
         "the budget's own check is blind",
@@ -111,6 +111,6 @@ MUTANTS = [
         "torch_dpc/attacks/query.py",
         "/ (2 * self.probe)",
         "/ self.probe",
-        QUERY + " -k finite_differences",
+        QUERY + " -k slope_by_queries",
     ),
 ]

@@ -18,7 +18,7 @@ MUTANTS = [
         INTERVALS,
         "const int is_tight = lower == upper; /* always held */",
         "const int is_tight = 0;",
-        BOXES + " -k random_boxes or choice",
+        BOXES,
     ),
     M(
         "kernel: multipliers beyond the price",

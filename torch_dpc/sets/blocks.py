@@ -103,7 +103,7 @@ class BlockStructure:
         """Return the eigenvalues of D1, `(..., N)`, and its eigenvectors block by block (ones where it is diagonal)."""
         values, vectors = [], []
         for (owner, _, _), D in zip(self._slices, blocks, strict=True):
-            value, vector = (D, torch.ones_like(D)) if owner.separable else torch.linalg.eigh(D)
+            value, vector = (D, torch.ones_like(D)) if owner.separable else torch.linalg.eigh(_finite(D))
             values.append(flat(value))
             vectors.append(vector)
         return joined(values).clamp(0.0, 1.0), vectors
@@ -158,3 +158,12 @@ def joined(parts: list[Tensor]) -> Tensor:
     """Concatenate the last dimension, batch dimensions broadcast."""
     batch = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
     return torch.cat([part.expand(*batch, -1) for part in parts], dim=-1)
+
+
+def _finite(D: Tensor) -> Tensor:
+    """Return matrices with the identity, a free block, for those that are not finite: LAPACK raises on them.
+
+    An iteration that diverges makes such a block; its sample is refused by its residual.
+    """
+    eye = torch.eye(D.shape[-1], dtype=D.dtype, device=D.device)
+    return torch.where(D.isfinite().all(-1, keepdim=True).all(-2, keepdim=True), D, eye)
