@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from ..checks import check_callable
-from .base import Attack, AttackCall, Planner
+from .base import Attack, AttackCall, Planner, within_budget
 from .budgets import Budget
 from .costs import check_cost
 from .objective import Objective
@@ -42,6 +42,7 @@ class Walk:
         stalls: steps in a row that did not improve psi, `(*batch,)`.
         size: what has become of the step size, `(*batch, 1, 1)`.
         velocity: of momentum.
+        first_p: after the first step.
     """
 
     p: Tensor
@@ -53,13 +54,14 @@ class Walk:
     stalls: Tensor
     size: Tensor
     velocity: Tensor
+    first_p: Tensor
 
     @staticmethod
     def at(p: Tensor) -> Walk:
         """Return a walk that has seen nothing yet."""
         none, psi = torch.zeros_like(p), torch.full(p.shape[:-2], torch.inf, dtype=p.dtype, device=p.device)
         size = torch.ones_like(psi)[..., None, None]
-        return Walk(p, psi, none, p, psi, none, torch.zeros_like(psi), size, none)
+        return Walk(p, psi, none, p, psi, none, torch.zeros_like(psi), size, none, p)
 
     def see(self, psi: Tensor, gradient: Tensor) -> None:
         """Take note of psi and its gradient at p."""
@@ -120,15 +122,25 @@ class IterativeAttack(Attack):
 
     def _perturb(self, call: AttackCall) -> Tensor:
         objective = self._objective(call)
+        first: Tensor | None = None  # Algorithm 1's answer
         for restart in range(self.restarts):
             walk = self._walk(objective, self._start(restart, objective.y_ini, call.generator), restart == 0)
             if restart == 0:
-                p, least = walk.best_p, walk.best_psi
+                p, least, first = walk.best_p, walk.best_psi, walk.first_p
             else:
                 better = improves(walk.best_psi, least)
                 p = torch.where(better[..., None, None], walk.best_p, p)
                 least = torch.where(better, walk.best_psi, least)
-        return p
+        if call.y_ini.dtype == torch.float64 or first is None:
+            return p
+        return self._as_seen(objective, call.y_ini, p, first)
+
+    def _as_seen(self, objective: Objective, y_ini: Tensor, p: Tensor, first: Tensor) -> Tensor:
+        """Return the better of two answers, each as the controller will see it in the lower precision of y_ini."""
+        rounded = [within_budget(x.to(y_ini.dtype), y_ini, self.budget) for x in (p, first)]
+        with torch.no_grad():
+            psi = [objective.psi((y_ini + x).double() - objective.y_ini) for x in rounded]
+        return torch.where((psi[0] <= psi[1])[..., None, None], rounded[0], rounded[1])
 
     def _walk(self, objective: Objective, start: Tensor, is_first: bool) -> Walk:
         """Go from one start; a sample whose gradient is at the floor, or whose psi stalls, leaves the batch."""
@@ -150,6 +162,7 @@ class IterativeAttack(Attack):
                 step = self._direction(walk, vertex, objective.y_ini, k)
                 moved = self._project(walk.p + step, objective.y_ini)
             walk.p = torch.where(active[..., None, None], moved, walk.p)
+            walk.first_p = walk.p if k == 0 else walk.first_p
         return self._end(walk, objective, active)
 
     def _start(self, restart: int, y_ini: Tensor, generator: torch.Generator | None) -> Tensor:
