@@ -16,8 +16,10 @@ A common factor on all four weights changes no plan. It is taken out: the mean o
 from ..data.predictor import Predictor
 from .objective import RobustObjective, Windows
 from .outcome import MeanError, OutputModel, QuadraticCost, RunCost
+from .parametrize import Positive, Semidefinite
 from .scales import WeightScales
 from .search import TuningResult, tune
+from .verdict import Verdict, compare, scenarios
 
 #: The earlier name of `Predictor` in this room.
 DataPredictor = Predictor
@@ -26,12 +28,17 @@ __all__ = [
     "DataPredictor",
     "MeanError",
     "OutputModel",
+    "Positive",
     "Predictor",
     "QuadraticCost",
     "RobustObjective",
     "RunCost",
+    "Semidefinite",
     "TuningResult",
+    "Verdict",
     "WeightScales",
     "Windows",
+    "compare",
+    "scenarios",
     "tune",
 ]

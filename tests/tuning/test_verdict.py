@@ -1,0 +1,83 @@
+"""What counts as a better controller, and weights that stay in their domain."""
+
+import pytest
+import torch
+from torch.nn.utils import parametrize
+
+import torch_dpc as dpc
+from helpers import HOLDING, Y_REF, generator, masses_data, randn
+from torch_dpc import attacks, tuning
+
+
+def layer(**weights):
+    data = masses_data(0.0, steps=200, t_ini=4, horizon=20)
+    options = {"Q": 10.0, "R": 1.0, "lambda_g": 1.0, "lambda_s": 1e4, **weights}
+    return dpc.DPCLayer(data, u_set=dpc.Box(-1.0, 1.0), **options)
+
+
+SUITE = {
+    "Algorithm 1": lambda planner: attacks.LinearizedAttack(
+        planner, attacks.TargetInput(torch.zeros(2)), attacks.RelativeBall(0.1)
+    ),
+    "random noise": lambda planner: attacks.RandomAttack(attacks.RelativeBall(0.1)),
+}
+
+
+def errors(planner, spread, **options):
+    starts = 0.3 * Y_REF + spread * randn(8, 4, seed=2)
+    run = {"y_ref": 0.3 * Y_REF, "u_ref": 0.3 * HOLDING, "resets": {"state": starts}, "u_warmup": 0.3}
+    plant = dpc.systems.OscillatingMasses()
+    return tuning.scenarios(plant, planner, **run, attacks=SUITE, steps=80, channels=[0, 1], replan_every=5, **options)
+
+
+def test_a_controller_that_holds_its_input_is_rejected():
+    """Weights that ignore the outputs: on its reference nothing can move it, and it no longer controls."""
+    honest, holding = layer(), layer(Q=1e-6, lambda_s=1e-3)
+    hollow = tuning.compare(errors(honest, 0.0), errors(holding, 0.0))
+    assert hollow.dominates, "judged from the reference alone it looks better: the claim that must not be made"
+    more = {"other_y_ref": 0.2 * Y_REF, "push": torch.tensor([0.3, -0.3])}
+    verdict = tuning.compare(errors(honest, 0.2, **more), errors(holding, 0.2, **more))
+    assert not verdict.dominates
+    assert {"from every start", "pushed", "another reference"} <= set(verdict.worse)
+    assert "from every start" in str(verdict)
+
+
+def test_a_controller_does_not_dominate_itself():
+    own = errors(layer(), 0.2)
+    verdict = tuning.compare(own, own)
+    assert not verdict.worse and not verdict.better and not verdict.dominates
+
+
+def test_the_interval_is_paired():
+    """A small gain on every run is seen although the runs differ by far more."""
+    spread = 10 * torch.rand(30, dtype=torch.float64, generator=generator())
+    gain = 0.1 + 0.01 * randn(30)
+    verdict = tuning.compare({"runs": spread}, {"runs": spread - gain})
+    assert verdict.dominates and -0.11 < verdict.low["runs"] < verdict.high["runs"] < -0.09
+
+
+def test_other_scenarios_and_runs_are_named():
+    with pytest.raises(ValueError, match="must hold the same scenarios"):
+        tuning.compare({"a": torch.ones(3)}, {"b": torch.ones(3)})
+    with pytest.raises(ValueError, match="must hold the same runs"):
+        tuning.compare({"a": torch.ones(3)}, {"a": torch.ones(4)})
+
+
+def test_weights_under_adam_stay_in_their_domain():
+    planner = layer(
+        Q=torch.nn.Parameter(10 * torch.eye(4).double()), lambda_s=torch.nn.Parameter(torch.tensor(1.0).double())
+    )
+    parametrize.register_parametrization(planner, "Q", tuning.Semidefinite())
+    parametrize.register_parametrization(planner, "lambda_s", tuning.Positive())
+    torch.testing.assert_close(planner.Q.detach(), 10 * torch.eye(4, dtype=torch.float64))
+    optimizer = torch.optim.Adam(planner.parameters(), lr=1.0)
+    u_ini, y_ini = torch.zeros(4, 2).double(), 0.1 * randn(4, 4)
+    for _ in range(10):
+        optimizer.zero_grad()
+        planner(u_ini, y_ini, y_ref=0.3 * Y_REF).u.square().sum().backward()
+        optimizer.step()
+    assert float(planner.lambda_s) > 0 and torch.linalg.eigvalsh(planner.Q).min() > -1e-9
+    with pytest.raises(ValueError, match="must be positive"):
+        tuning.Positive().right_inverse(torch.tensor(0.0))
+    with pytest.raises(ValueError, match="positive semidefinite"):
+        tuning.Semidefinite().right_inverse(-torch.eye(2))
