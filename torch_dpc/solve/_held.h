@@ -1,7 +1,7 @@
 /* The symmetric system on the directions that the sets hold, W'(G + diag reach) W + diag curvature.
  *
- * Intervals hold a row, blocks the directions of _sets.h. The rows of all held intervals and blocks are gathered, and
- * the blocks rotated in place. The free direction of a cone's boundary becomes a row of the identity.
+ * Intervals hold a row, blocks the directions of _sets.h. The rows of all held intervals and blocks are gathered, the
+ * blocks rotated in place, and the free directions of cones' boundaries dropped.
  */
 #ifndef TORCH_DPC_HELD_H
 #define TORCH_DPC_HELD_H
@@ -93,11 +93,38 @@ INLINE void rows_to_basis(
     }
 }
 
-/* Make the free direction of a cone's boundary, row p, a row of the identity with the right-hand side zero. */
-INLINE void free_row(Workspace *w, int64_t p, int64_t k) {
-    for (int64_t i = 0; i < p; i++) w->U[i * w->capacity + p] = 0.0;
-    memset(w->U + p * w->capacity, 0, bytes(k + 1));
-    w->U[p * w->capacity + p] = 1.0;
+/* Leave the free directions of cones' boundaries out of the rotated system, in place. Return how many rows are left,
+ * and write where they were. */
+INLINE int64_t drop_free(const Sets *sets, Workspace *w, Held held) {
+    const int64_t k = held.rows, stride = w->capacity;
+    int64_t *places = w->curved.places, count = 0, p = held.intervals;
+    for (int64_t i = 0; i < held.intervals; i++) places[count++] = i;
+    for (int64_t b = 0; b < sets->blocks; b++) {
+        const int64_t size = sets->start[b + 1] - sets->start[b];
+        if (w->curved.state[b] == OFF) continue;
+        for (int64_t i = w->curved.state[b] == EDGE; i < size; i++) places[count++] = p + i;
+        p += size;
+    }
+    if (count == k) return k;
+    for (int64_t i = 0; i < count; i++) { /* no row or column moves up: what is read is not yet overwritten */
+        const double *from = w->U + places[i] * stride;
+        double *to = w->U + i * stride;
+        for (int64_t c = first_column(i, 0); c < count; c++) to[c] = from[places[c]];
+        to[count] = from[k];
+        for (int64_t c = count + 1; c < round_up(count + 1, BLOCK); c++) to[c] = 0.0;
+    }
+    return count;
+}
+
+/* Put the solution back to where the rows were, zero at those that were left out. */
+INLINE void restore_free(Workspace *w, int64_t k, int64_t count) {
+    if (count == k) return;
+    int64_t i = count - 1;
+    for (int64_t p = k - 1; p >= 0; p--) {
+        const int is_there = i >= 0 && w->curved.places[i] == p;
+        w->x[p] = is_there ? w->x[i] : 0.0;
+        i -= is_there;
+    }
 }
 
 /* Bring the gathered system to the bases of the blocks, and add the curvature. */
@@ -112,7 +139,6 @@ INLINE void rotate_system(const Sets *sets, Workspace *w, Held held) {
             const int64_t begin = p / WIDTH * WIDTH; /* what lies left of the block is never used */
             rows_to_basis(sets, c, b, w->U + p * stride + begin, stride, round_up(k + 1, WIDTH) - begin);
             columns_to_basis(sets, c, b, w->U + p, stride, p + size);
-            if (c->state[b] == EDGE) free_row(w, p, k);
             const int64_t tangent = p + 1 + (c->state[b] == EDGE);
             for (int64_t i = tangent; i < p + size; i++) w->U[i * stride + i] += c->curvature[b];
         }
@@ -144,8 +170,10 @@ INLINE int solve_held(
         for (int64_t c = k + 1; c < end; c++) Ui[c] = 0.0;
     }
     rotate_system(sets, w, held);
-    if (!factor(w, k, 0, least)) return 0;
-    substitute(w, k);
+    const int64_t count = drop_free(sets, w, held);
+    if (!factor(w, count, 0, least)) return 0;
+    substitute(w, count);
+    restore_free(w, k, count);
     int64_t p = held.intervals;
     for (b = 0; b < sets->blocks; b++) {
         if (w->curved.state[b] == OFF) continue;
