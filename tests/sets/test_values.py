@@ -75,3 +75,12 @@ def test_a_set_of_ones_own_has_no_numbers():
 
     sets = FeasibleSet.of([("u_set", Narrow(-1.0, 1.0), STEPS, 2)])
     assert values_of(sets, torch.Size([1]), CPU) is None
+
+
+def test_a_block_that_is_not_finite_stops_no_batch():
+    sets = FeasibleSet.of([("u_set", dpc.Ball(1.0), STEPS, 2)])
+    D = torch.full((2, STEPS, 2, 2), torch.nan, dtype=torch.float64)
+    D[1] = torch.diag(torch.tensor([0.0, 0.5], dtype=torch.float64))
+    values, vectors = sets.spectral([D])
+    assert torch.equal(values[0], torch.ones(2 * STEPS)) and vectors[0].isfinite().all()
+    assert torch.equal(values[1], torch.tensor([0.0, 0.5]).repeat(STEPS))
