@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -59,7 +60,8 @@ class RobustObjective:
         psi: what the attacker minimises, a callable DPCSolution -> `(*batch,)`, as the attacks take it; with `at(step)`
             it moves with the run, step 0 being the first of the run here. By default minus the cost of the plan in
             force: the attacker wants the worst.
-        predictor: what inputs truly do; by default the layer's own data.
+        predictor: what inputs truly do: `tuning.Predictor(other_data)` of a recording that the layer has not seen, or a
+            model. By default the layer's own data, with a warning.
         cost: of a run; by default the quadratic one with the layer's present Q and R.
         plans: how many plans a run has, each from the window that the one before left.
         replan_every: steps of each plan that are applied; by default all.
@@ -120,6 +122,12 @@ class RobustObjective:
         self.layer, self.budget, self.psi, self.attack = layer, budget, psi, attack
         self.plans, self.replan_every, self.iterations = plans, replan_every, iterations
         self.attacked_weight, self.through = attacked_weight, through
+        if predictor is None:
+            warnings.warn(
+                "without `predictor=` the data of the layer judge its own plans, and the closed loop may get worse as "
+                "the objective falls: give tuning.Predictor(other_data).",
+                stacklevel=2,
+            )
         self.predictor = Predictor(layer.data) if predictor is None else predictor
         self.cost = _own_cost(layer) if cost is None else cost
         self.u_ini, self.y_ini = _past(windows)
