@@ -180,6 +180,14 @@ def test_1_norm_projection_against_a_quadratic_program(radius, relative_to):
         torch.testing.assert_close(near.reshape(-1), sample.sign().reshape(-1) * nearest, rtol=0, atol=ORACLE)
 
 
+def test_the_ellipsoid_answers_with_the_axes_it_can_reach():
+    """min <c, p> over sum (p / s)^2 <= 1 is -|s c|, at p = -s^2 c / |s c|."""
+    c = randn(30, 3, 4, seed=2)
+    p = attacks.Ellipsoid(SIZES).minimize_linear(c, c)
+    torch.testing.assert_close((c * p).sum((-2, -1)), -two(SIZES * c))
+    torch.testing.assert_close(p, -SIZES.square() * c / two(SIZES * c)[..., None, None])
+
+
 @pytest.mark.parametrize("relative_to", [False, True])
 def test_ellipsoid_projection_against_scipy(relative_to):
     y_ini, p = randn(6, 2, 3, seed=1), 2 * randn(6, 2, 3, seed=2)

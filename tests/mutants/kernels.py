@@ -28,10 +28,17 @@ MUTANTS = [
         SETS + " -k random_sets or priced",
     ),
     M(
-        "kernel: Newton accepts any step",
-        NEWTON,
-        "if (size_trial < (1.0 - 1e-4 * fraction) * size) break;",
-        "break;",
+        "kernel: a ball of twice the radius",
+        "torch_dpc/solve/_sets.h",
+        "const double fraction = distance > radius ? (1.0 - radius / distance) / gamma : 0.0;",
+        "const double fraction = distance > radius ? (1.0 - 0.5 * radius / distance) / gamma : 0.0;",
+        SETS + " -k random_sets",
+    ),
+    M(
+        "kernel: a cone's apex is missed",
+        "torch_dpc/solve/_sets.h",
+        "if (distance <= -head) of_head = of_rest = 1.0 / gamma;",
+        "if (distance <= -2.0 * head) of_head = of_rest = 1.0 / gamma;",
         SETS + " -k random_sets",
     ),
     M(

@@ -120,7 +120,7 @@ def test_tolerances_are_the_documented_ones():
 def test_a_direction_proves_only_what_it_separates(v0, Ct, is_proof):
     bounds = Bounds(torch.tensor([-1.0]).double(), torch.tensor([1.0]).double())
     d, rows = torch.ones(1).double(), torch.full((1, 1), Ct).double()
-    assert bool(certificate._separates(d, rows, torch.tensor([v0]).double(), bounds)) is is_proof
+    assert bool(certificate._separates(d, rows, torch.tensor([v0], dtype=torch.float64), bounds)) is is_proof
 
 
 def test_a_multiplier_is_weak_by_the_displacement_it_makes():
