@@ -52,8 +52,8 @@ MUTANTS = [
     M(
         "the attack is subtracted",
         LOOP,
-        "u = self.controller.step(u_ini, y_ini + self.p, **refs)",
-        "u = self.controller.step(u_ini, y_ini - self.p, **refs)",
+        "u = self.controller.step(u_ini, y_ini + self.p, **refs, alarm=self.alarm)",
+        "u = self.controller.step(u_ini, y_ini - self.p, **refs, alarm=self.alarm)",
         TESTS + " -k attack_is_on or sees_the_truth or reaches_the_plant",
     ),
     M(

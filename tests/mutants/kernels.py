@@ -2,7 +2,7 @@
 
 from .mutant import Mutant as M
 
-INTERVALS, NEWTON, SOLUTION = (f"torch_dpc/solve/_{name}.h" for name in ("intervals", "newton", "solution"))
+INTERVALS, NEWTON, SOLUTION = (f"torch_dpc/solve/_{name}.h" for name in ("primal_dual", "newton", "solution"))
 BOXES, SETS = "solve/test_kernels.py", "solve/test_kernel_sets.py"
 
 MUTANTS = [

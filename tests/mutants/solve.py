@@ -123,7 +123,7 @@ MUTANTS = [
         LINEAR,
         "lower_bar = torch.where(is_lower, b_bar, 0.0)",
         "lower_bar = torch.where(is_lower, 0.0, b_bar)",
-        GRADIENTS + " -k gradcheck",
+        GUARDS,
     ),
     M(
         "tangents of bounds by lam <= 0",
@@ -145,7 +145,7 @@ MUTANTS = [
         "torch_dpc/solve/projected_system.py",
         "rhs = -times(G, v_bar) if lam_bar is None else lam_bar - times(G, v_bar)",
         "rhs = times(G, v_bar) if lam_bar is None else lam_bar - times(G, v_bar)",
-        CURVED + " -k are_those_of_differences",
+        CURVED + " -k gradcheck_and",
         False,
     ),
     M(
@@ -153,7 +153,7 @@ MUTANTS = [
         "torch_dpc/solve/projected_system.py",
         "torch.where(on, gamma[rows] * d[..., rows] /",
         "torch.where(on, 0 * d[..., rows] /",
-        CURVED + " -k are_those_of_differences",
+        CURVED + " -k gradcheck_and",
         False,
     ),
     M(
@@ -161,7 +161,7 @@ MUTANTS = [
         "torch_dpc/solve/adjoint.py",
         "G_bar = outer(-s, out, G)",
         "G_bar = outer(s, out, G)",
-        GRADIENTS + " -k gradgradcheck",
+        "problem/test_reduction.py -k twice",
     ),
     M(
         "cotangents of the multipliers ignored",
@@ -199,7 +199,7 @@ MUTANTS = [
         ACTIVE,
         "(independence.amin(-1) > INDEPENDENCE_TOLERANCE)",
         "(independence.amin(-1) > -1)",
-        ENGINES + " solve/test_corners.py -k depend or oracle or one_point or cycles",
+        GUARDS,
         False,
     ),
     M(
@@ -207,8 +207,7 @@ MUTANTS = [
         NEWTON,
         "violated[:, rows] = False",
         "violated[:] = False",
-        ENGINES + " -k oracle or paths or random",
-        False,
+        "solve/test_kernels.py -k iteration_of_torch",
     ),
     M(
         "DAQP's flag is believed",

@@ -9,7 +9,7 @@ import torch
 import torch_dpc as dpc
 from helpers import Y_REF, small_layer, windows
 from torch_dpc.sets.bounds import Bounds
-from torch_dpc.solve import certificate, daqp, optimality, outcome, weakness
+from torch_dpc.solve import active_set, certificate, daqp, optimality, outcome, weakness
 from torch_dpc.solve.compiled import CompiledPlanner
 from torch_dpc.solve.engines import Engines
 from torch_dpc.solve.outcome import Found
@@ -121,6 +121,14 @@ def test_a_direction_proves_only_what_it_separates(v0, Ct, is_proof):
     bounds = Bounds(torch.tensor([-1.0]).double(), torch.tensor([1.0]).double())
     d, rows = torch.ones(1).double(), torch.full((1, 1), Ct).double()
     assert bool(certificate._separates(d, rows, torch.tensor([v0], dtype=torch.float64), bounds)) is is_proof
+
+
+def test_rows_that_depend_on_each_other_are_not_trusted():
+    """A Cholesky factor of their system exists by rounding, and its answer is rounding."""
+    rows = torch.tensor([[1.0, 0.0], [1.0, 1e-6], [0.0, 1.0]], dtype=torch.float64)
+    active = torch.tensor([[True, True, False], [True, False, True]])
+    trusted = active_set._packed(rows @ rows.T, active, torch.ones(2, 3, dtype=torch.float64))[1]
+    assert trusted.tolist() == [False, True]
 
 
 def test_a_multiplier_is_weak_by_the_displacement_it_makes():
