@@ -84,6 +84,16 @@ class Solved(NamedTuple):
                 whole[samples] = of_samples
 
 
+class JudgedSets(NamedTuple):
+    """What the conditions say of a batch: v, residual, active and weak rows, n_active and n_weakly_active."""
+
+    v: Tensor
+    residual: Tensor
+    active: Tensor
+    weak: Tensor | None
+    counts: tuple[Tensor, Tensor]
+
+
 class Planned(NamedTuple):
     """The solution as the autograd Function returns it.
 

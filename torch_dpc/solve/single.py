@@ -95,10 +95,9 @@ class SingleSolver:
         v0 = self.optimality.unconstrained(theta)
         assert self.engines.workspace is not None
         lam, flag, iterations = self.engines.workspace.solve(lower - v0, upper - v0, sense_of(lower == upper))
-        v, residual, active, n_active, n_weak = self.optimality.judge(
-            self.optimality.displaced(v0, lam), lam, lower, upper, self.optimality.error(theta, lam)
-        )
-        if not (flag == SOLVED_FLAG and residual <= ACCEPTANCE.convincing):  # NaN is not either
+        raw, error = self.optimality.displaced(v0, lam), self.optimality.error(theta, lam)
+        v, residual, active, n_active, n_weak = self.optimality.judge(raw, lam, lower, upper, 0.0)
+        if not (flag == SOLVED_FLAG and residual + error <= ACCEPTANCE.convincing):  # NaN is not either
             return None
         unit, per_unit = self._units
         info = np.array((Status.SOLVED, iterations, residual, n_active, n_weak), dtype=np.float64)

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
-from typing import Any, NamedTuple
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -31,7 +31,7 @@ from .consistency import inconsistency
 from .engines import Engines, Sets
 from .kernels import PlannedArrays
 from .optimality import BATCHED, Optimality
-from .outcome import ACCEPTANCE, Planned, Solved, check_finite, joined, report_failures
+from .outcome import ACCEPTANCE, JudgedSets, Planned, Solved, check_finite, joined, report_failures
 from .projected_system import newton_step
 from .second_look import SecondLook
 from .selection import uncharged
@@ -200,6 +200,7 @@ class Solver:
         raw, error = self.optimality.displaced(v0, found.lam), self.optimality.error(theta, found.lam)
         solved = self._judged(raw, found.lam, sets, error, found.iterations)
         doubtful = ~(solved.info[..., 2] <= ACCEPTANCE.convincing)
+        solved.info[..., 2] -= torch.where(doubtful, 0.0, error)  # a bound that convinces is not part of what is told
         if bool(doubtful.any()):
             self._look_again(solved, theta, moved, sets, doubtful)
         if self.reduction.is_selection:
@@ -246,11 +247,11 @@ class Solver:
         info = torch.stack([x.double() for x in (failed * Status.FAILED, iterations, residual, *counts)], dim=-1)
         return Solved(v, lam, active, info, weak)
 
-    def _judge_box(self, raw: Tensor, lam: Tensor, sets: Bounds, error: Tensor) -> _Judged:
+    def _judge_box(self, raw: Tensor, lam: Tensor, sets: Bounds, error: Tensor) -> JudgedSets:
         v, residual, active, n_active, n_weakly_active = self.optimality.judge(raw, lam, *sets.tensors, error)
-        return _Judged(v, residual, active, None, (n_active, n_weakly_active))
+        return JudgedSets(v, residual, active, None, (n_active, n_weakly_active))
 
-    def _judge_sets(self, raw: Tensor, lam: Tensor, sets: FeasibleSet, error: Tensor) -> _Judged:
+    def _judge_sets(self, raw: Tensor, lam: Tensor, sets: FeasibleSet, error: Tensor) -> JudgedSets:
         """Judge with the projection onto the sets; count the directions that D holds, block by block."""
         batch, G = raw.shape[:-1], self.reduction.G
         values = values_of(sets, batch, raw.device)
@@ -259,7 +260,7 @@ class Solver:
             verdict = kernels.judge_sets(G, flat, multipliers, values)
             v, missed, weak, active, of_each = (x.reshape(*batch, x.shape[-1]) for x in verdict)
             residual = self.optimality.residual(lam, missed, error)
-            return _Judged(v, residual, active, weak, (of_each[..., 0], of_each[..., 1]))
+            return JudgedSets(v, residual, active, weak, (of_each[..., 0], of_each[..., 1]))
         order, inverse, gamma = self.engines.order, self.engines.inverse, self.engines.gamma
         raw = raw[..., order]
         lam_in_parts, diagonal = lam[..., order], self.engines.G_in_parts.diagonal(dim1=-2, dim2=-1)
@@ -272,7 +273,7 @@ class Solver:
         d, _ = sets.spectral(sets.freed(sets.jacobians(v + gamma * lam_in_parts, gamma), weak))
         active = (d < HELD).expand_as(v)
         counts = active.sum(-1), sets.touching(v, weak, WEAKLY_ACTIVE).expand(v.shape[:-1])
-        return _Judged(v[..., inverse], residual, active[..., inverse], weak[..., inverse], counts)
+        return JudgedSets(v[..., inverse], residual, active[..., inverse], weak[..., inverse], counts)
 
     def _mark_failures(self, solved: Solved, theta: Tensor, v0: Tensor, gap: Tensor | None, sets: Sets) -> None:
         """Look for certificates; leave NaN for v and nothing else of a sample without a solution."""
@@ -292,13 +293,3 @@ class Solver:
             emptied[failed] = 0
         if solved.weak is not None:
             solved.weak[failed] = True
-
-
-class _Judged(NamedTuple):
-    """What the conditions say of a batch: v, residual, active and weak rows, n_active and n_weakly_active."""
-
-    v: Tensor
-    residual: Tensor
-    active: Tensor
-    weak: Tensor | None
-    counts: tuple[Tensor, Tensor]
