@@ -34,8 +34,9 @@ MUTANTS: list[Mutant] = [m for room in (control, attacks, kernels, solve, data, 
 
 
 def key(mutant: Mutant) -> str:
-    """Return what changes when the mutant, or the file it is made of, does."""
-    text = repr(mutant) + (ROOT / mutant.file).read_text()
+    """Return what changes when the mutant, the file it is made of, or its tests do."""
+    paths = [ROOT / mutant.file, *(ROOT / "tests" / path for path in mutant.tests.split(" -k ")[0].split())]
+    text = repr(mutant) + "".join(path.read_text() for path in paths)
     return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
