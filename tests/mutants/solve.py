@@ -212,7 +212,7 @@ MUTANTS = [
     M(
         "DAQP's flag is believed",
         "torch_dpc/solve/single.py",
-        "if not (flag == SOLVED_FLAG and residual <= ACCEPTANCE.convincing)",
+        "if not (flag == SOLVED_FLAG and residual + error <= ACCEPTANCE.convincing)",
         "if not (flag == SOLVED_FLAG)",
         GUARDS,
     ),
