@@ -26,7 +26,7 @@ class Acceptance:
 
     residual: float = 1e-8
     convincing: float = 1e-9
-    of_selection: float = 1e-7
+    of_selection: float = 1e-8
 
 
 ACCEPTANCE = Acceptance()
