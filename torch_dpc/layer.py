@@ -195,6 +195,11 @@ class DPCLayer(ConfiguredModule):
         planned = plan(factored.solver, theta, factored.reduction, sets, on_failure)
         return solution_of(Recovery(self._setup.data, factored.reduction, factored.solver, sets, dtype, theta, planned))
 
+    @property
+    def has_bounds(self) -> bool:
+        """Whether every set is a box, so that the layer has :meth:`bounds`."""
+        return isinstance(self._factors.sets(self._setup, self.data.device), Bounds)
+
     def bounds(self, device: torch.device) -> tuple[Tensor, Tensor]:
         """Return the bounds of (u, y, du) flattened, `(N,)` or `(*batch, N)` each, float64, with their graph.
 

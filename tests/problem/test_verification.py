@@ -81,7 +81,7 @@ def plans():
 @pytest.mark.parametrize("fraction", [0.0, 0.5])
 def test_a_cost_that_loses_a_term(monkeypatch, fraction):
     """The rows of lambda_s are left out of the factorisation, or halved: right after correction, or marked."""
-    expected, whole = plans(), reduction_module._least_squares
+    expected, whole = plans(), reduction_module.least_squares
 
     def without(rows, weights):
         E, f = whole(rows, weights)
@@ -90,7 +90,7 @@ def test_a_cost_that_loses_a_term(monkeypatch, fraction):
         scale[-k:] = fraction
         return E * scale, f * scale
 
-    monkeypatch.setattr(reduction_module, "_least_squares", without)
+    monkeypatch.setattr(reduction_module, "least_squares", without)
     found = plans()
     solved = found.info.status == dpc.Status.SOLVED
     assert not solved.any() or relative(found.u[solved], expected.u[solved]) < 1e-7

@@ -75,7 +75,7 @@ def sensitivity_bound(layer: DPCLayer, budget: Budget | None = None, *, outputs:
     check_type("layer", layer, DPCLayer)
     if budget is not None:
         check_type("budget", budget, Budget)
-    if not layer.feasible_set.is_box:
+    if not layer.has_bounds:
         raise ValueError("`layer` must have boxes as its sets.")
     reduction, data = layer.reduction.detach(), layer.data
     n_u, first = data.horizon * data.n_u, data.t_ini * data.n_u

@@ -17,7 +17,8 @@ from torch import Tensor
 from ..batching import times
 from ..sets.bounds import Bounds
 from ..sets.feasible import FeasibleSet
-from .reduction import Reduction, gram_of_charged
+from .least_squares import gram_of_charged
+from .reduction import Reduction
 
 
 def optimal_cost(reduction: Reduction, theta: Tensor, lam: Tensor, v: Tensor, sets: Bounds | FeasibleSet) -> Tensor:

@@ -29,11 +29,12 @@ import torch
 from torch import Tensor
 
 from ..autodiff import carries_derivative, constant, untransformed
-from .factorization import ROUNDING, factor_cost
+from .factorization import factor_cost
+from .least_squares import gram_of_charged, least_squares, moved_by, without_rounding
 from .rows import DataRows
 from .saddle import Saddle, known_solution
 from .verification import Map, Posed, Term, verify
-from .weights import Weights, psd_root
+from .weights import Weights
 
 
 @dataclass(frozen=True, eq=False)
@@ -161,12 +162,12 @@ def _constants(rows: DataRows, weights: Weights) -> tuple[DataRows, Weights]:
 
 def _values(rows: DataRows, weights: Weights) -> Reduction:
     """Return the reduced problem of constants."""
-    E, f = _least_squares(rows, weights)
+    E, f = least_squares(rows, weights)
     factor = factor_cost(E)
     T, batch = factor.T, E.shape[:-2]
     Z = rows.Z.expand(*batch, *rows.Z.shape[-2:])
     Z = Z.gather(-1, factor.order[..., None, :].expand_as(Z))
-    CZ, kernel = _moved_by(factor.kernel, _without_rounding(rows.C @ Z, rows.C), rows.tolerance)
+    CZ, kernel = moved_by(factor.kernel, without_rounding(rows.C @ Z, rows.C), rows.tolerance)
     Ct = torch.linalg.solve_triangular(T, CZ, upper=True, left=False)
     X_theta = torch.linalg.solve_triangular(T, factor.Q.mT @ f, upper=True)
     # One step of refinement: it matters where weights of zero leave E a condition of 1e10.
@@ -271,57 +272,6 @@ def _map_of(flat: Reduction, i: int, kernel: Tensor) -> Map:
     )
 
 
-def _moved_by(kernel: Tensor, CZ: Tensor, tolerance: float) -> tuple[Tensor, Tensor]:
-    """Return C Z and how the kernel of the cost `(..., n_x, n_k)` moves v, zero on the rows that it hardly moves.
-
-    A row that the cost charges is one: its rounding, over the small charge of the kernel, would stand for a motion.
-    """
-    norm, moved = torch.linalg.vector_norm, CZ @ kernel
-    hardly = (norm(moved, dim=-1) <= tolerance * norm(CZ, dim=-1))[..., None]
-    return CZ - torch.where(hardly, moved, 0.0) @ kernel.mT, torch.where(hardly, 0.0, moved)
-
-
-def _without_rounding(product: Tensor, rows: Tensor) -> Tensor:
-    """Return the rows times a matrix of orthonormal columns, zero where only rounding is left.
-
-    A row of the problem that the equalities decide is such a row: its rounding would stand for a motion that does not
-    exist.
-    """
-    norm = torch.linalg.vector_norm
-    return torch.where((norm(product, dim=-1) <= ROUNDING * norm(rows, dim=-1))[..., None], 0.0, product)
-
-
-def _least_squares(rows: DataRows, weights: Weights) -> tuple[Tensor, Tensor]:
-    """Return E `(..., k, n_x)` and the matrix of f = (matrix) theta, `(..., k, n_theta)`."""
-    # Each block row of the cost, with the matrix that makes its target of a part of theta, and where that part begins.
-    root_g = (2 * weights.lambda_g).sqrt()[..., None, None]
-    blocks: list[tuple[Tensor, Tensor | None, int | None]] = [(root_g * _charged(rows), None, None)]
-    for term in rows.tracking:
-        if (weight := getattr(weights, term.weight)) is not None:
-            root = psd_root(weight)
-            blocks.append((root @ rows.C[..., term.rows, :], root, term.reference))
-    for fit in rows.fits:
-        root = (2 * getattr(weights, fit.weight)).sqrt()[..., None, None]
-        blocks.append((root * fit.rows, root * _eye(fit.rows.shape[-2], fit.rows), fit.measured))
-    batch = torch.broadcast_shapes(*(block.shape[:-2] for block, _, _ in blocks))
-    E, f = [], []
-    for block, matrix, start in blocks:
-        E.append(_without_rounding(block @ rows.Z, block).expand(*batch, -1, -1))
-        target = block.new_zeros(*batch, block.shape[-2], rows.n_theta)
-        if matrix is not None and start is not None:
-            target[..., start : start + matrix.shape[-1]] = matrix
-        target[..., rows.Eq_theta] -= block @ rows.Eq_pinv
-        f.append(target)
-    return torch.cat(E, dim=-2), torch.cat(f, dim=-2)
-
-
-def _charged(rows: DataRows) -> Tensor:
-    """M in the coordinates a, the identity on the entries beyond the rank of W; or all of the identity."""
-    if rows.charged.ndim == 1:
-        return torch.diag(rows.charged)[rows.charged.bool()]
-    return torch.diag_embed(rows.charged)
-
-
 def _with_graph(reduction: Reduction) -> tuple[Tensor, Tensor]:
     """Attach the derivative of [Psi Eq'; Eq 0] [a; mu] = [Phi theta - C' lam; e] to its known solution."""
     rows, weights = reduction.rows, reduction.weights
@@ -349,22 +299,3 @@ def _with_graph(reduction: Reduction) -> tuple[Tensor, Tensor]:
     saddle = Saddle(T=reduction.T, Z=reduction.Z, Eq_pinv=rows.Eq_pinv)
     solution = known_solution(Psi, rows.Eq, top, bottom, solution.expand(*batch, -1, -1), saddle)
     return solution[..., : rows.n_theta], -solution[..., rows.n_theta :]
-
-
-def gram_of_charged(rows: DataRows) -> Tensor:
-    """M = I - W^+ W in the coordinates a (or I), with its derivative at constant rank of W where W has a graph."""
-    N = _charged(rows)
-    M = N.mT @ N
-    W = torch.cat([rows.Up, rows.Yp, rows.Uf], dim=-2)
-    if not carries_derivative((W,)) or rows.is_identity:
-        return M
-    W = W / rows.theta_scale[..., : W.shape[-2], None]  # M is the same in any units
-    with torch.no_grad():
-        W_pinv = torch.linalg.pinv(W, rtol=rows.tolerance)
-    # M dW = 0 at the point itself, so the term below is 0 in value and -(W^+ dW M + M dW' W^+') in derivative.
-    change = W_pinv @ (W - W.detach()) @ M
-    return M - change - change.mT
-
-
-def _eye(n: int, like: Tensor) -> Tensor:
-    return torch.eye(n, dtype=like.dtype, device=like.device)

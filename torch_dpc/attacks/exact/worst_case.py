@@ -139,7 +139,7 @@ def worst_case(
         raise ValueError(f"`cost` must be a TargetInput, whose psi is convex in the plan, got {type(cost).__name__}.")
     check_type("layer", layer, DPCLayer)
     check_type("budget", budget, Budget)
-    if not layer.feasible_set.is_box:
+    if not layer.has_bounds:
         raise ValueError("`layer` must have boxes as its sets: curved sets have more than three states a row.")
     check_number("time_limit", time_limit, positive=True, finite=False)
     if not check_number("tolerance", tolerance, kind="at least 1e-6 and finite") >= 1e-6:
