@@ -9,7 +9,7 @@ they part. {versions}.
 
 {table}
 
-None of the sensible problems is solved wrongly. What is left sits in extreme weights, and in units that differ between
+What is left sits in extreme weights, and in units that differ between
 channels which one `lambda_s` weighs: plans that cost more than the optimum by 1e-6 and more, and curved or priced sets
 that end as FAILED. Each finding is in `results/fuzz/failures.txt` with the call that replays it.
 
