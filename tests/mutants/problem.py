@@ -7,10 +7,16 @@ OPT, TERMS, REDUCTION = "solve/test_optimality.py", "problem/test_terms.py", "pr
 GRAD = "solve/test_gradients.py"
 
 MUTANTS = [
-    M("lambda_g without its 2", RED, "root_g = (2 * weights.lambda_g).sqrt()", "root_g = weights.lambda_g.sqrt()", OPT),
+    M(
+        "lambda_g without its 2",
+        "torch_dpc/problem/least_squares.py",
+        "root_g = (2 * weights.lambda_g).sqrt()",
+        "root_g = weights.lambda_g.sqrt()",
+        OPT,
+    ),
     M(
         "lambda_s without its 2",
-        RED,
+        "torch_dpc/problem/least_squares.py",
         "root = (2 * getattr(weights, fit.weight)).sqrt()",
         "root = getattr(weights, fit.weight).sqrt()",
         OPT,
@@ -67,10 +73,16 @@ MUTANTS = [
         "return solution[..., : rows.n_theta], solution[..., rows.n_theta :]",
         REDUCTION,
     ),
-    M("derivative through M is lost", RED, "return M - change - change.mT", "return M", REDUCTION),
+    M(
+        "derivative through M is lost",
+        "torch_dpc/problem/least_squares.py",
+        "return M - change - change.mT",
+        "return M",
+        REDUCTION,
+    ),
     M(
         "derivative through M has the wrong sign",
-        RED,
+        "torch_dpc/problem/least_squares.py",
         "return M - change - change.mT",
         "return M + change + change.mT",
         REDUCTION,
