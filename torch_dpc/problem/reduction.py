@@ -127,12 +127,8 @@ class Reduction:
 
 def _map_tensors(holder: Any, change: Callable[[Tensor], Tensor]) -> Any:
     """Return a copy of a dataclass with its tensors changed."""
-    changed = {f.name: change(getattr(holder, f.name)) for f in fields(holder) if _is_tensor(getattr(holder, f.name))}
-    return replace(holder, **changed)
-
-
-def _is_tensor(value: Any) -> bool:
-    return isinstance(value, Tensor)
+    values = {f.name: getattr(holder, f.name) for f in fields(holder)}
+    return replace(holder, **{name: change(x) for name, x in values.items() if isinstance(x, Tensor)})
 
 
 def reduce(rows: DataRows, weights: Weights) -> Reduction:

@@ -10,11 +10,14 @@ import torch
 from torch import Tensor
 
 from ..batching import times
+from ..problem.cost import terms_of_cost
 from ..problem.reduction import Reduction
 from .outcome import ACCEPTANCE
 
 #: Singular values at or below this fraction of the largest are no direction to correct along.
 NO_DIRECTION = 1e-13
+#: A miss of a reference that costs nothing worth the name, relative to the unit of its channel.
+NEGLIGIBLE = 1e-8
 
 
 def rounding_of(reduction: Reduction, theta: Tensor, a: Tensor, v: Tensor) -> Tensor:
@@ -52,6 +55,34 @@ def inconsistency(reduction: Reduction, theta: Tensor, lam: Tensor, v: Tensor) -
     a = a + rounding_of(reduction, theta, a, v)
     missed = (v - times(reduction.rows.C, a)) / reduction.scale
     return (missed.abs() / (1 + (v / reduction.scale).abs())).amax(-1)
+
+
+def excess_cost(reduction: Reduction, theta: Tensor, lam: Tensor, v: Tensor) -> Tensor:
+    """Return a bound on what the best g of a plan costs beyond the optimum, relative to its cost, `(*batch,)`.
+
+    The cost is quadratic with the Hessian T'T on the kernel of Eq, so a slope r of the Lagrangian is worth at most
+    1/2 |T^-T r|^2. Along the kernel of the cost T holds the small charge alone: a slope that is left there counts most.
+    A cost below that of missing every target by :data:`NEGLIGIBLE` of its unit counts as that.
+    """
+    rows, n = reduction.rows, v.shape[-1]
+    a = times(reduction.A_theta, theta) - times(reduction.A_lam, lam)
+    a = (a + rounding_of(reduction, theta, a, v)).detach().requires_grad_()
+    with torch.enable_grad():
+        cost = terms_of_cost(reduction, theta, a)
+        (slope,) = torch.autograd.grad(cost.sum(), a)
+    slope = times(reduction.Z.mT, slope + times(rows.C[..., :n, :].mT, lam[..., :n]))
+    worth = torch.linalg.solve_triangular(reduction.T.mT, slope[..., None], upper=False)[..., 0]
+    return worth.square().sum(-1) / 2 / torch.maximum(cost.detach().abs(), _negligible_cost(reduction))
+
+
+def _negligible_cost(reduction: Reduction) -> Tensor:
+    rows, weights = reduction.rows, reduction.weights
+    total = torch.zeros((), dtype=torch.float64, device=reduction.T.device) + torch.finfo(torch.float64).tiny
+    for term in rows.tracking:
+        if (weight := getattr(weights, term.weight)) is not None:
+            near = NEGLIGIBLE * reduction.scale[..., term.rows]
+            total = total + (weight.diagonal(dim1=-2, dim2=-1) * near.square()).sum(-1) / 2
+    return total
 
 
 def _solved(matrix: Tensor, missed: Tensor) -> Tensor:

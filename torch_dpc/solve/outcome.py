@@ -22,11 +22,13 @@ class Acceptance:
         residual: largest residual of an accepted sample (:mod:`torch_dpc.solve.optimality`).
         convincing: residual above which a sample gets a second look in extended precision.
         of_selection: largest amount by which the best g may miss a plan that moved along the kernel of the cost.
+        excess: largest cost of such a plan beyond the optimum, relative to it.
     """
 
     residual: float = 1e-8
     convincing: float = 1e-9
-    of_selection: float = 1e-8
+    of_selection: float = 1e-7
+    excess: float = 1e-7
 
 
 ACCEPTANCE = Acceptance()
@@ -82,6 +84,15 @@ class Solved(NamedTuple):
         for whole, of_samples in zip(self, part, strict=True):
             if whole is not None and of_samples is not None:
                 whole[samples] = of_samples
+
+    def empty(self, samples: Tensor, status: Status) -> None:
+        """Leave NaN for v, and nothing else but the status, of some samples `(*batch,)`, boolean, in place."""
+        self.info[..., 0] = torch.where(samples, float(status), self.info[..., 0])
+        self.v[samples] = torch.nan
+        for emptied in (self.lam, self.active, self.info[..., 3:]):
+            emptied[samples] = 0
+        if self.weak is not None:
+            self.weak[samples] = True
 
 
 class JudgedSets(NamedTuple):

@@ -27,7 +27,7 @@ from . import kernels
 from .active_set import solve_active
 from .certificate import is_infeasible
 from .compiled import CompiledPlanner
-from .consistency import inconsistency
+from .consistency import excess_cost, inconsistency
 from .engines import Engines, Sets
 from .kernels import PlannedArrays
 from .optimality import BATCHED, Optimality
@@ -127,7 +127,11 @@ class Solver:
         """Solve by engines, judge, second look and certificate, whatever the problem."""
         check_finite(theta, self.sizes)
         solved = self.in_units._solve_flat(theta, in_units(sets, self.unit))
-        return solved._replace(v=solved.v * self.unit, lam=solved.lam / self.unit)
+        solved = solved._replace(v=solved.v * self.unit, lam=solved.lam / self.unit)
+        if self.reduction.is_selection:
+            excess = excess_cost(self.reduction, theta, solved.lam, solved.v)
+            solved.empty(~solved.failed & ~(excess <= ACCEPTANCE.excess), Status.FAILED)
+        return solved
 
     def _completed(self, quick: PlannedArrays, theta: Tensor, sets: Sets) -> Solved:
         """Solve the samples generally that do not convince."""
@@ -286,10 +290,5 @@ class Solver:
         else:
             order = self.engines.order
             proven = is_infeasible(Ct[..., order, :], v0[..., order], sets, None if gap is None else gap[..., order])
-        status = torch.where(proven | unreachable, float(Status.INFEASIBLE), float(Status.FAILED))
-        solved.info[..., 0] = torch.where(failed, status, solved.info[..., 0])
-        solved.v[failed] = torch.nan
-        for emptied in (solved.lam, solved.active, solved.info[..., 3:]):
-            emptied[failed] = 0
-        if solved.weak is not None:
-            solved.weak[failed] = True
+        solved.empty(failed & ~(proven | unreachable), Status.FAILED)
+        solved.empty(failed & (proven | unreachable), Status.INFEASIBLE)
