@@ -51,8 +51,7 @@ def test_a_given_window_is_used_at_once():
 
 def test_a_prepared_plan_costs_the_next_act_nothing():
     layer, plant, calls = small_layer(), OscillatingMasses(), []
-    forward = layer._call
-    layer._call = lambda *a: calls.append(1) or forward(*a)
+    layer.register_forward_pre_hook(lambda module, inputs: calls.append(1))
     controller = dpc.DPCController(layer, 2)
     y = plant.reset()
     for k in range(8):

@@ -73,6 +73,7 @@ def test_a_plan_is_applied_open_loop_until_the_next(replan_every):
     log = dpc.simulate(plant, controller, Y_REF, steps=13, u_ref=HOLDING, reset={"state": torch.ones(4)})
     for k, (u_ini, y_ini, refs, _) in enumerate(controller.told):
         if k % replan_every == 0:
+            refs.pop("alarm", None)  # the controller's alone
             plan = layer(u_ini, y_ini, **refs)
             for j in range(min(replan_every, 13 - k)):
                 assert torch.equal(log.u[k + j], plan.u[j])

@@ -41,11 +41,14 @@ class Predictor:
             W = W / torch.where(scale > 0, scale, 1.0)
             orthogonal, T = torch.linalg.qr(W)  # of full column rank, W^+ = T^-1 orthogonal'
             inverse = torch.linalg.solve_triangular(T, orthogonal.mT, upper=True)
-            #: The map (u_ini, y_ini, u) -> y, `(horizon n_y, t_ini (n_u + n_y) + horizon n_u)`.
-            self.matrix = data.Yf.detach().double() @ basis @ inverse / torch.where(scale > 0, scale, 1.0).mT
+            #: The map (u_ini, y_ini, u) -> y, `(horizon n_y, t_ini (n_u + n_y) + horizon n_u)`, and its constant.
+            matrix = data.Yf.detach().double() @ basis @ inverse / torch.where(scale > 0, scale, 1.0).mT
+            # Data of an affine layer begin with a row of ones, whose value is 1 in every window.
+            self.matrix = matrix[:, int(data.has_ones) :]
+            self.constant = matrix[:, 0] if data.has_ones else matrix.new_zeros(len(matrix))
 
     def __call__(self, u_ini: Any, y_ini: Any, u: Any) -> Tensor:
-        """Return the predicted outputs, `(*batch, horizon, n_y)`, in the dtype of u; linear, with its derivative.
+        """Return the predicted outputs, `(*batch, horizon, n_y)`, in the dtype of u; affine, with its derivative.
 
         Args:
             u_ini, y_ini: the window, `(*batch, t_ini, n)`.
@@ -61,5 +64,6 @@ class Predictor:
                 raise ValueError(f"`{name}` must have shape (*batch, {size[0]}, {size[1]}), got {tuple(part.shape)}.")
         batch = torch.broadcast_shapes(*(part.shape[:-2] for part in parts))
         flat = [part.double().flatten(-2).expand(*batch, -1) for part in parts]
-        y = torch.cat(flat, dim=-1) @ self.matrix.to(parts[2].device).mT
+        device = parts[2].device
+        y = torch.cat(flat, dim=-1) @ self.matrix.to(device).mT + self.constant.to(device)
         return y.reshape(*batch, self.horizon, self.n_y).to(parts[2].dtype)
