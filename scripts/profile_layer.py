@@ -159,7 +159,7 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--out", type=Path, default=RESULTS, help="folder for the results (default results/)")
     args = parser.parse_args(argv)
     torch.set_num_threads(args.threads)
-    if not kernels.serve(torch.ones(())):
+    if not kernels.has_kernels(torch.ones(())):
         raise SystemExit("The kernels were not built, so there is nothing to profile: install with a C compiler.")
     recording = record(PLANT, N_G + T_INI + HORIZON - 1)
     layer = layer_of(PLANT, *recording, HORIZON)

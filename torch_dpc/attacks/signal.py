@@ -139,7 +139,7 @@ class SignalAttack(Attack):
         seen: list[_Rollout] = []
         for guess in guesses:
             with torch.no_grad():
-                seen.append(self._foresee(call, before, present, guess))
+                seen.append(self._predict_run(call, before, present, guess))
             seen += self._walk(call, before, present, seen[-1].used)
         costs = torch.stack([run.cost for run in seen])
         best = costs.argmin(0)
@@ -154,7 +154,7 @@ class SignalAttack(Attack):
         for _ in range(self.steps):
             with torch.enable_grad():
                 free = signal.detach().requires_grad_()
-                run = self._foresee(call, before, present, free)
+                run = self._predict_run(call, before, present, free)
                 finite = torch.where(run.cost.isfinite(), run.cost, 0.0).sum()
                 (slope,) = torch.autograd.grad(finite, free)
             run = _Rollout(run.cost.detach(), run.used.detach())
@@ -168,7 +168,7 @@ class SignalAttack(Attack):
             signal = kept - size * euclidean(vertex) * direction(gradient)
         return seen
 
-    def _foresee(
+    def _predict_run(
         self, call: AttackCall, before: Tensor, present: tuple[Tensor, ...], signal: Tensor | Attack
     ) -> _Rollout:
         """Return the run under a signal, `(plans, *batch, t_ini, n_y)`, projected onto the budget on the way."""

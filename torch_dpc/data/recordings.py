@@ -1,4 +1,4 @@
-"""Recordings at the door: what came as u and y, as lists of matching tensors, and their windows."""
+"""Validation of recordings: u and y as lists of matching tensors, and their windows."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from torch import Tensor
 
 from ..batching import times
 from . import kernels
-from .kernels import STANDING_OUT as INDEPENDENCE_TOLERANCE
+from .kernels import INDEPENDENCE_TOLERANCE
 
 #: A row of Ct whose part outside the span of the rows before it is below this fraction of its length is dependent.
 DEPENDENT_ROW = 1e-9
@@ -32,7 +32,7 @@ def solve_active(G: Tensor, Ct: Tensor, active: Tensor, rhs: Tensor) -> tuple[Te
         lam `(B, N)`, zero outside A, and whether the rows A were independent, `(B,)`. Where they were not, dependent
         rows are left out (lam = 0).
     """
-    lam, trusted = (kernels.solve_active if kernels.serve(rhs) else _packed)(G, active, rhs)
+    lam, trusted = (kernels.solve_active if kernels.has_kernels(rhs) else _packed)(G, active, rhs)
     for i in [] if bool(trusted.all()) else (~trusted).nonzero()[:, 0].tolist():
         chosen = active[i].nonzero()[:, 0]
         rows, R = _independent_rows(Ct if Ct.ndim == 2 else Ct[i], chosen)
@@ -44,7 +44,7 @@ def solve_active(G: Tensor, Ct: Tensor, active: Tensor, rhs: Tensor) -> tuple[Te
 
 def adjoint(G: Tensor, Ct: Tensor, active: Tensor, v_bar: Tensor, lam_bar: Tensor | None) -> Tensor:
     """Return v0_bar = v_bar + s, s_A = G_AA^-1 (lam_bar - G v_bar)_A; the arguments are those of `solve_active`."""
-    if kernels.serve(v_bar):
+    if kernels.has_kernels(v_bar):
         v0_bar, trusted = kernels.adjoint(G, active, v_bar, lam_bar)
         if bool(trusted.all()):
             return v0_bar

@@ -42,7 +42,7 @@ class CompiledPlanner:
     def of(in_units: Reduction, unit: Tensor) -> CompiledPlanner | None:
         """Return the planner; None for a batch of problems, one that needs a selection or an idle input, or a GPU."""
         simple = in_units.G.ndim == 2 and in_units.rows.Eq_range is None and not in_units.is_selection
-        return CompiledPlanner(in_units, unit) if simple and kernels.serve(in_units.G) else None
+        return CompiledPlanner(in_units, unit) if simple and kernels.has_kernels(in_units.G) else None
 
     @cached_property
     def map(self) -> kernels.Map:
@@ -111,7 +111,7 @@ class CompiledPlanner:
 
     def arrays(self, sets: Sets, batch: torch.Size, device: torch.device) -> kernels.SetArrays | None:
         """Return the sets in units as the kernel reads them; None if it does not know them, or another batch."""
-        if not kernels.serve(self.unit):
+        if not kernels.has_kernels(self.unit):
             return None
         kept = self._kept[0] if self._kept else None
         if kept is not None and kept[0] is sets:

@@ -123,7 +123,7 @@ class Engines:
         if chosen != "auto":
             return chosen == "daqp"
         few = v0.device.type == "cpu" and v0.numel() <= CHOICE.daqp_batch * v0.shape[-1]
-        return few and self.reduction.Ct.ndim == 2 and not kernels.serve(v0)
+        return few and self.reduction.Ct.ndim == 2 and not kernels.has_kernels(v0)
 
     def daqp(self, v0: Tensor, sets: Sets) -> Found:
         """Solve boxes by DAQP."""

@@ -24,10 +24,10 @@ SETTINGS = KernelSettings()
 
 #: Sets as the kernels read them.
 SetArrays = tuple[np.ndarray | None, ...]
-HYSTERESIS, STANDING_OUT = SETTINGS.hysteresis, SETTINGS.independence
+HYSTERESIS, INDEPENDENCE_TOLERANCE = SETTINGS.hysteresis, SETTINGS.independence
 
 
-def serve(tensor: Tensor) -> bool:
+def has_kernels(tensor: Tensor) -> bool:
     """Return whether the kernels are built, and take the solves that this tensor is a part of."""
     return _kernels is not None and tensor.device.type == "cpu"
 

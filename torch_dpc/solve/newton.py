@@ -53,7 +53,7 @@ def solve_newton(G: Tensor, Ct: Tensor, v0: Tensor, lower: Tensor, upper: Tensor
         v0: the unconstrained minimisers, `(B, N)`.
         lower, upper: `(N,)` or `(B, N)`.
     """
-    if kernels.serve(v0):
+    if kernels.has_kernels(v0):
         return _by_kernel(G, v0, lower, upper)
     return _batched(G, Ct, v0, lower, upper)
 
