@@ -24,9 +24,8 @@ ENERGY_ROOM = 100.0
 class WindowStatistic(NamedTuple):
     """How unusual a window is; larger is more unusual.
 
-    Attributes:
-        energy: T2 = n |W1^+ w|^2, the size of the window in the metric of the recorded windows, `(*batch,)`.
-        residual: the squared distance from the recorded windows, whitened by what the data leave there, `(*batch,)`.
+    - `energy`: T2 = n |W1^+ w|^2, the size of the window in the metric of the recorded windows, `(*batch,)`.
+    - `residual`: the squared distance from the recorded windows, whitened by what the data leave there, `(*batch,)`.
     """
 
     energy: Tensor
