@@ -27,10 +27,8 @@ def require_boxes(planner: Any) -> None:
     """Raise ValueError unless a planner is a layer whose sets are boxes."""
     if not isinstance(planner, DPCLayer):
         raise ValueError(f'`on_failure="soften"` needs a DPCLayer, got {type(planner).__name__}.')
-    try:
-        planner.bounds(torch.device("cpu"))
-    except ValueError as error:
-        raise ValueError('`on_failure="soften"` widens boxes; give the layer a SoftBox as `y_set` instead.') from error
+    if not planner.has_bounds:
+        raise ValueError('`on_failure="soften"` widens boxes; give the layer a SoftBox as `y_set` instead.')
 
 
 def plan_softened(layer: DPCLayer, theta: Tensor, weight: float) -> tuple[DPCSolution, float]:

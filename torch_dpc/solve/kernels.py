@@ -63,7 +63,7 @@ def has_kernel_for(v0: Tensor, values: SetValues | None) -> bool:
         v0: the unconstrained minimisers.
         values: the sets as numbers; None for a set that only torch knows.
     """
-    return _kernels is not None and v0.device.type == "cpu" and values is not None
+    return has_kernels(v0) and values is not None
 
 
 def solve_sets(G: Tensor, v0: Tensor, values: SetValues) -> Found:
