@@ -11,6 +11,8 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .shapes import broadcast_shapes
+
 
 def as_data(name: str, value: Any, *, finite: bool = True) -> Tensor:
     """Return floating data as a tensor; a tensor passes as it is, with its graph.
@@ -206,12 +208,9 @@ def one_batch(named: Iterable[tuple[str, torch.Size]]) -> torch.Size:
         ValueError: they do not; it names those that have a batch dimension.
     """
     batched = [(name, shape) for name, shape in named if len(shape)]
-    shapes = {shape for _, shape in batched}
-    if len(shapes) < 2:  # `broadcast_shapes` takes 20 us
-        return shapes.pop() if shapes else torch.Size(())
     try:
-        return torch.broadcast_shapes(*shapes)
-    except RuntimeError as error:
+        return broadcast_shapes(*{shape for _, shape in batched})
+    except ValueError as error:
         came = ", ".join(f"{name} {tuple(shape)}" for name, shape in batched)
         raise ValueError(f"the batch shapes must broadcast, got {came}.") from error
 

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 import torch
-from scipy.optimize import minimize
 from torch import Tensor
 
 from ..checks import check_type
@@ -144,7 +144,10 @@ def _independent(A: Tensor, G: Tensor, free: Free) -> float:
     log_tau = np.full(len(G), np.log(float(torch.linalg.eigvalsh(G)[-1]) if len(G) else 1.0))
     if len(G):
         for exponent in EXPONENTS:
-            log_tau = minimize(smooth, log_tau, (exponent,), jac=True, method="L-BFGS-B", options={"maxiter": 500}).x
+            found = scipy.optimize.minimize(
+                smooth, log_tau, (exponent,), jac=True, method="L-BFGS-B", options={"maxiter": 500}
+            )
+            log_tau = found.x
     matrix = schur(torch.from_numpy(log_tau))
     assert matrix is not None, "the search only accepts admissible multipliers"
     gamma = float(torch.linalg.eigvalsh(matrix)[-1]) * (1 + MARGIN)

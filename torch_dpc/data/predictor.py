@@ -8,6 +8,7 @@ import torch
 from torch import Tensor
 
 from ..checks import as_data
+from ..shapes import broadcast_shapes
 from .hankel import HankelData
 
 
@@ -62,7 +63,7 @@ class Predictor:
         for name, part, size in zip(("u_ini", "y_ini", "u"), parts, sizes, strict=True):
             if part.shape[-2:] != size:
                 raise ValueError(f"`{name}` must have shape (*batch, {size[0]}, {size[1]}), got {tuple(part.shape)}.")
-        batch = torch.broadcast_shapes(*(part.shape[:-2] for part in parts))
+        batch = broadcast_shapes(*(part.shape[:-2] for part in parts))
         flat = [part.double().flatten(-2).expand(*batch, -1) for part in parts]
         device = parts[2].device
         y = torch.cat(flat, dim=-1) @ self.matrix.to(device).mT + self.constant.to(device)

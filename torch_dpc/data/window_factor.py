@@ -12,9 +12,9 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
+import scipy
 import torch
 from numpy.typing import NDArray
-from scipy.linalg import lapack
 
 from ..checks import as_data, check_count
 from .rank import has_full_row_rank, relative_tolerance
@@ -216,7 +216,7 @@ class WindowFactor:
     def _fold(self, block: NDArray[np.float64]) -> None:
         """Replace R by the triangle of [R; block]; both are overwritten, (rows, rows) and (new, rows) by columns."""
         panel = min(PANEL, len(self._R))
-        self._R, _, _, info = lapack.dtpqrt(0, panel, self._R, block, overwrite_a=1, overwrite_b=1)
+        self._R, _, _, info = scipy.linalg.lapack.dtpqrt(0, panel, self._R, block, overwrite_a=1, overwrite_b=1)
         assert info == 0, info
 
 

@@ -12,6 +12,7 @@ from torch import Tensor
 from ..checks import window
 from ..data.hankel import HankelData
 from ..data.recordings import as_recordings, hankel
+from ..shapes import broadcast_shapes
 from .cusum import Cusum
 
 #: The residual of noise-free data is rounding. It is measured in this fraction of the largest singular value.
@@ -175,7 +176,7 @@ class ConsistencyDetector:
     def _flat(self, u_ini: Any, y_ini: Any) -> Tensor:
         u_ini = window("u_ini", u_ini, self.t_ini, self.n_u, "n_u").double()
         y_ini = window("y_ini", y_ini, self.t_ini, self.n_y, "n_y").double()
-        batch = torch.broadcast_shapes(u_ini.shape[:-2], y_ini.shape[:-2])
+        batch = broadcast_shapes(u_ini.shape[:-2], y_ini.shape[:-2])
         return torch.cat([x.flatten(-2).expand(*batch, -1) for x in (u_ini, y_ini)], dim=-1)
 
     def _calibrated(self) -> tuple[float, float]:

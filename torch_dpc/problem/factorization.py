@@ -13,8 +13,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
+import scipy
 import torch
-from scipy.linalg import qr
 from torch import Tensor
 
 #: A row is zero where what is left of it is at most this fraction of what it was made of: n_x roundings, with a margin.
@@ -71,7 +71,8 @@ def _row_stable_qr(E: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     for i, matrix in enumerate(E.detach().cpu().reshape(batch.numel(), k, n).numpy()):
         if short:
             rows = np.argsort(-np.abs(matrix).max(axis=1), kind="stable")
-            Q[i, rows], T[i], order[i] = qr(matrix[rows], mode="economic", pivoting=True, check_finite=False)
+            factors = scipy.linalg.qr(matrix[rows], mode="economic", pivoting=True, check_finite=False)
+            Q[i, rows], T[i], order[i] = factors
     parts = ((Q, (k, short)), (T, (short, n)), (order, (n,)))
     return tuple(torch.from_numpy(part).reshape(*batch, *own).to(E.device) for part, own in parts)  # type: ignore[return-value]
 

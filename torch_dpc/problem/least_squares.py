@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..autodiff import carries_derivative
+from ..shapes import broadcast_shapes
 from .factorization import ROUNDING
 from .rows import DataRows
 from .weights import Weights, psd_root
@@ -26,7 +27,7 @@ def least_squares(rows: DataRows, weights: Weights) -> tuple[Tensor, Tensor]:
     for fit in rows.fits:
         root = (2 * getattr(weights, fit.weight)).sqrt()[..., None, None]
         blocks.append((root * fit.rows, root * _eye(fit.rows.shape[-2], fit.rows), fit.measured))
-    batch = torch.broadcast_shapes(*(block.shape[:-2] for block, _, _ in blocks))
+    batch = broadcast_shapes(*(block.shape[:-2] for block, _, _ in blocks))
     E, f = [], []
     for block, matrix, start in blocks:
         E.append(without_rounding(block @ rows.Z, block).expand(*batch, -1, -1))

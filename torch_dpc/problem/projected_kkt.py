@@ -19,6 +19,7 @@ import torch
 from torch import Tensor
 
 from ..data.hankel import HankelData
+from ..shapes import broadcast_shapes
 from .compact_form import CompactForm, compact_form
 from .terms import Sizes
 from .weights import Weights
@@ -104,7 +105,7 @@ class FullSystem:
         assert like is not None
         v_bar, lam_bar = (torch.zeros_like(like) if bar is None else bar for bar in (v_bar, lam_bar))
         tail = self.tails[0]
-        batch = torch.broadcast_shapes(v_bar.shape[:-1], lam_bar.shape[:-1], D1.shape[: D1.ndim - tail])
+        batch = broadcast_shapes(v_bar.shape[:-1], lam_bar.shape[:-1], D1.shape[: D1.ndim - tail])
         flat = [bar.expand(*batch, -1).reshape(-1, bar.shape[-1]) for bar in (v_bar, lam_bar)]
         D1 = D1.expand(*batch, *D1.shape[D1.ndim - tail :]).reshape(-1, *D1.shape[D1.ndim - tail :])
         out = v_bar.new_empty(len(flat[0]), sum(Sizes.of(self.data).theta) + v_bar.shape[-1])

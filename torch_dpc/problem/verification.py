@@ -17,8 +17,8 @@ from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.linalg import solve_triangular
 
 Array = NDArray[Any]
 
@@ -173,7 +173,9 @@ def _rounding(posed: Posed, found: Map, size: Array) -> tuple[Array, Array]:
         size: of the terms of the slope, `(m,)`.
     """
     norm = np.linalg.norm
-    back = solve_triangular(found.T, _off_kernel(found, found.CZ.T), trans="T") if found.CZ.size else found.CZ.T
+    back = found.CZ.T
+    if back.size:
+        back = scipy.linalg.solve_triangular(found.T, _off_kernel(found, back), trans="T")
     length, own = norm(found.A, axis=0), np.abs(found.values)
     reached = norm(posed.C, axis=1)
     for term in posed.terms:  # a term that is off by its rounding moves v as its target does, which the map says
@@ -183,7 +185,7 @@ def _rounding(posed: Posed, found: Map, size: Array) -> tuple[Array, Array]:
         else:
             weight = np.einsum("ij,ij->", term.S, term.W @ term.S if term.W.ndim else term.W * term.S)
             reached = reached + norm(back, axis=0) * np.sqrt(weight)
-    moved = norm(_off_kernel(found, solve_triangular(found.T, back)), axis=0)
+    moved = norm(_off_kernel(found, scipy.linalg.solve_triangular(found.T, back)), axis=0)
     of_eq = norm(posed.Eq, axis=1) / posed.theta_scale[posed.places]
     return reached[:, None] * length + moved[:, None] * size + own, (of_eq[:, None] + 1) * (length + 1)
 
@@ -213,8 +215,8 @@ def _moved(found: Map, slope: Array) -> Array:
     """Return (T'T)^-1 slope, by how much x is off, without what falls on the kernel of the cost: that moves no cost."""
     if not slope.size:
         return slope
-    weighted = solve_triangular(found.T, _off_kernel(found, slope), trans="T")
-    return _off_kernel(found, solve_triangular(found.T, weighted))
+    weighted = scipy.linalg.solve_triangular(found.T, _off_kernel(found, slope), trans="T")
+    return _off_kernel(found, scipy.linalg.solve_triangular(found.T, weighted))
 
 
 def _off_kernel(found: Map, x: Array) -> Array:

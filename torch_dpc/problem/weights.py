@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..autodiff import is_mapped
+from ..shapes import broadcast_shapes
 
 #: Asymmetry of Q or R, relative to its largest entry, up to which it is rounding and is averaged away.
 ASYMMETRY = 1e-6
@@ -106,7 +107,7 @@ def output_weight(Q: Any, Q_terminal: Any, n_y: int, horizon: int) -> Tensor:
         return whole
     last = weight_matrix("Q_terminal", Q_terminal, n_y, 1)
     before = (horizon - 1) * n_y
-    batch = torch.broadcast_shapes(whole.shape[:-2], last.shape[:-2])
+    batch = broadcast_shapes(whole.shape[:-2], last.shape[:-2])
     rest, last = whole[..., :before, :before].expand(*batch, -1, -1), last.expand(*batch, -1, -1)
     side = whole.new_zeros(*batch, before, n_y)
     return torch.cat([torch.cat([rest, side], -1), torch.cat([side.mT, last.to(whole)], -1)], -2)

@@ -14,6 +14,7 @@ from functools import cached_property
 import torch
 from torch import Tensor
 
+from ..shapes import broadcast_shapes
 from .base import ConvexSet, Part
 
 #: The Jacobian of the projection, part by part: its diagonal `(..., groups, size)` where the set is separable, blocks
@@ -63,7 +64,7 @@ class BlockStructure:
             rows = matrix[..., at, :].unflatten(-2, shape)  # (..., groups, size, k)
             moved = D[..., None] * rows if owner.separable else D @ rows
             out.append((rows - moved).flatten(-3, -2))
-        batch = torch.broadcast_shapes(*(part.shape[:-2] for part in out))
+        batch = broadcast_shapes(*(part.shape[:-2] for part in out))
         return torch.cat([part.expand(*batch, *part.shape[-2:]) for part in out], dim=-2)
 
     def freed(self, blocks: Blocks, weak: Tensor) -> Blocks:
@@ -156,7 +157,7 @@ def flat(x: Tensor) -> Tensor:
 
 def joined(parts: list[Tensor]) -> Tensor:
     """Concatenate the last dimension, batch dimensions broadcast."""
-    batch = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
+    batch = broadcast_shapes(*(part.shape[:-1] for part in parts))
     return torch.cat([part.expand(*batch, -1) for part in parts], dim=-1)
 
 

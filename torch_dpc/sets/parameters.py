@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..autodiff import is_mapped
+from ..shapes import broadcast_shapes
 
 
 def as_bound(name: str, value: Any) -> Tensor | float:
@@ -37,8 +38,8 @@ def as_tensor(bound: Tensor | float) -> Tensor:
 def check_order(lower: Tensor, upper: Tensor) -> None:
     """Raise ValueError unless lower <= upper and a finite point lies between; bounds under `vmap` are not checked."""
     try:
-        torch.broadcast_shapes(lower.shape, upper.shape)
-    except RuntimeError as error:
+        broadcast_shapes(lower.shape, upper.shape)
+    except ValueError as error:
         came = f"{tuple(lower.shape)} and {tuple(upper.shape)}"
         raise ValueError(f"`lower` and `upper` must have shapes that broadcast, got {came}.") from error
     if is_mapped(lower) or is_mapped(upper):

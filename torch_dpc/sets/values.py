@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
+from ..shapes import broadcast_shapes
 from .base import ConvexSet
 from .bounds import Bounds
 from .box import Box, SoftBox
@@ -120,7 +121,7 @@ def _is_known(owner: ConvexSet) -> bool:
 
 def _put(x: Tensor, places: Tensor, values: Tensor) -> Tensor:
     """Return x `(..., N)` with values `(*batch, groups, size)` at the places `(groups, size)`."""
-    batch = torch.broadcast_shapes(x.shape[:-1], values.shape[:-2])
+    batch = broadcast_shapes(x.shape[:-1], values.shape[:-2])
     x = x.expand(*batch, x.shape[-1]).clone()
     x[..., places] = values
     return x
@@ -134,5 +135,5 @@ def _flat(x: Tensor, batch: torch.Size) -> Tensor:
 def _joined(parts: list[Tensor], device: torch.device) -> Tensor:
     if not parts:
         return torch.zeros(0, dtype=torch.float64, device=device)
-    batch = torch.broadcast_shapes(*(part.shape[:-1] for part in parts))
+    batch = broadcast_shapes(*(part.shape[:-1] for part in parts))
     return torch.cat([part.expand(*batch, -1) for part in parts], dim=-1)

@@ -23,6 +23,7 @@ from ..sets.bounds import Bounds
 from ..sets.feasible import FeasibleSet
 from ..sets.units import in_units
 from ..sets.values import values_of
+from ..shapes import broadcast_shapes
 from . import kernels
 from .active_set import solve_active
 from .certificate import is_infeasible
@@ -163,7 +164,7 @@ class Solver:
     def _solve_flat(self, theta: Tensor, sets: Sets) -> Solved:
         """Solve samples with one batch dimension; with those of the sets if their parameters have any."""
         if isinstance(sets, FeasibleSet) and sets.batch_shape:
-            batch = torch.broadcast_shapes(theta.shape[:-1], sets.batch_shape, self.reduction.V.shape[:-2])
+            batch = broadcast_shapes(theta.shape[:-1], sets.batch_shape, self.reduction.V.shape[:-2])
             return self._solve_all(theta.expand(*batch, theta.shape[-1]), sets)
         vectors = (theta, *sets.tensors) if isinstance(sets, Bounds) and not sets.are_shared else (theta,)
         batch, _, (samples, *bounds) = flatten_batch((self.reduction.G,), vectors)
