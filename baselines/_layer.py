@@ -77,8 +77,8 @@ def cost_rows_of(layer: DPCLayer) -> CostRows:
             for name, value in (("lambda_g", layer.lambda_g), ("lambda_s", layer.lambda_s))
         )
         rows = CostRows(
-            root_R=psd_root(weight_matrix("R", layer.R, data.n_u, data.horizon)),
-            root_Q=psd_root(weight_matrix("Q", layer.Q, data.n_y, data.horizon)),
+            root_R=psd_root(weight_matrix("R", layer.R, data.n_u, data.horizon), data.n_u),
+            root_Q=psd_root(weight_matrix("Q", layer.Q, data.n_y, data.horizon), data.n_y),
             M=root_g * projector(data),
             Yp=root_s * data.Yp.double(),
             root_s=root_s,

@@ -22,7 +22,7 @@ def least_squares(rows: DataRows, weights: Weights) -> tuple[Tensor, Tensor]:
     blocks: list[tuple[Tensor, Tensor | None, int | None]] = [(root_g * _charged(rows), None, None)]
     for term in rows.tracking:
         if (weight := getattr(weights, term.weight)) is not None:
-            root = psd_root(weight)
+            root = psd_root(weight, term.channels)
             blocks.append((root @ rows.C[..., term.rows, :], root, term.reference))
     for fit in rows.fits:
         root = (2 * getattr(weights, fit.weight)).sqrt()[..., None, None]

@@ -235,7 +235,7 @@ def _one_of(flat: Reduction, i: int, is_batched: bool) -> Posed:
     C = of_data(rows.C)
     terms = [Term(2 * of_weights("lambda_g"), np.diag(charged)[charged != 0], None)]
     terms += [
-        Term(of_weights(term.weight), C[term.rows], term.reference)
+        Term(of_weights(term.weight), C[term.rows], term.reference, term.rows)
         for term in rows.tracking
         if getattr(flat.weights, term.weight) is not None
     ]
@@ -262,7 +262,7 @@ def _map_of(flat: Reduction, i: int, kernel: Tensor) -> Map:
         values=np.concatenate([V, -G], axis=1),
         A=np.concatenate([A_theta, -A_lam], axis=1),
         T=T,
-        CZ=Ct @ T,
+        Ct=Ct,
         kernel=kernel.cpu().numpy(),
         Eq_pinv=Eq_pinv.cpu().numpy(),
     )

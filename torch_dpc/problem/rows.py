@@ -36,11 +36,13 @@ class Tracking:
         weight: the name of the weight.
         rows: the part of v.
         reference: where in theta its reference begins; None for zero.
+        channels: entries of a step.
     """
 
     weight: str
     rows: slice
     reference: int | None
+    channels: int
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,13 +158,16 @@ class DataRows:
         y_ref = u_ref + len(Uf)
         n_theta = y_ref + len(Yf)
         n_v = len(Uf) + len(Yf)
-        tracking = [Tracking("R", slice(0, len(Uf)), u_ref), Tracking("Q", slice(len(Uf), n_v), y_ref)]
+        tracking = [
+            Tracking("R", slice(0, len(Uf)), u_ref, data.n_u),
+            Tracking("Q", slice(len(Uf), n_v), y_ref, data.n_y),
+        ]
         fits = [Fit("lambda_s", Yp, len(Up))]
         parts = [Uf, Yf]
         if terms.rates:
             # The input before the plan is (Up a)'s last step, which the equality rows hold at the measured one.
             parts.append(Uf - torch.cat([Up, Uf])[len(Up) - data.n_u : -data.n_u])
-            tracking.append(Tracking("R_du", slice(n_v, n_v + len(Uf)), None))
+            tracking.append(Tracking("R_du", slice(n_v, n_v + len(Uf)), None, data.n_u))
         equal, places = [], []
         if terms.slack:
             fits.append(Fit("lambda_u", Up[int(terms.affine) :], int(terms.affine)))

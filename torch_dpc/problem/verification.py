@@ -47,11 +47,32 @@ SETTINGS = VerificationSettings()
 
 @dataclass(frozen=True)
 class Term:
-    """A term of the cost, 1/2 (S a - target)'W (S a - target): W a matrix or a number; where in theta target begins."""
+    """A term of the cost, 1/2 (S a - target)'W (S a - target).
+
+    Attributes:
+        W: a matrix or a number.
+        S: rows, `(k, r)`.
+        start: where in theta the target begins; None for zero.
+        of_v: where S is a part of C, which part.
+    """
 
     W: Array
     S: Array
     start: int | None
+    of_v: slice | None = None
+
+    def missed(self, A: Array, v: Array) -> Array:
+        """Return S a - target for each column of A, `(k, m)`, given v = C A."""
+        missed = self.S @ A if self.of_v is None else v[self.of_v].copy()
+        if self.start is not None:
+            rows = np.arange(len(missed))
+            missed[rows, self.start + rows] -= 1
+        return missed
+
+    def force(self, missed: Array) -> Array:
+        """Return S'W missed, `(r, m)`."""
+        weighted: Array = self.S.T @ self.W if self.W.ndim else self.S.T * self.W
+        return weighted @ missed
 
 
 @dataclass(frozen=True)
@@ -78,19 +99,25 @@ class Posed:
 
     def to(self, dtype: Any) -> Posed:
         """Return the same numbers in another precision."""
-        terms = tuple(Term(t.W.astype(dtype), t.S.astype(dtype), t.start) for t in self.terms)
+        terms = tuple(replace(term, W=term.W.astype(dtype), S=term.S.astype(dtype)) for term in self.terms)
         return replace(self, terms=terms, C=self.C.astype(dtype), Eq=self.Eq.astype(dtype), Z=self.Z.astype(dtype))
 
-    def slope(self, A: Array) -> tuple[Array, Array]:
-        """Return the slope of the cost on the kernel of Eq for each column of A, `(n_x, m)`, and its terms' size."""
-        forces, n_theta = [], len(self.theta_scale)
+    def slope(self, A: Array, v: Array) -> tuple[Array, Array]:
+        """Return the slope of the cost on the kernel of Eq for each column of A, `(n_x, m)`, and its terms' size.
+
+        Args:
+            A: columns, `(r, m)`.
+            v: C A, `(N, m)`.
+        """
+        total, n_theta = np.zeros_like(A), len(self.theta_scale)
+        total[:, n_theta:] = self.C.T
+        size = np.zeros(A.shape[1])
+        size[n_theta:] = _norms(self.C.T)
         for term in self.terms:
-            missed = term.S @ A
-            if term.start is not None:
-                missed[:, term.start : term.start + len(missed)] -= np.eye(len(missed), dtype=A.dtype)
-            forces.append(term.S.T @ (term.W @ missed if term.W.ndim else term.W * missed))
-        forces.append(np.concatenate([np.zeros((len(A), n_theta), A.dtype), self.C.T], axis=1))
-        return self.Z.T @ sum(forces), sum(np.linalg.norm(force.astype(float), axis=0) for force in forces)
+            force = term.force(term.missed(A, v))
+            size += _norms(force)
+            total += force
+        return self.Z.T @ total, size
 
     def missed(self, A: Array) -> Array:
         """Return Eq a - e, in its units, for each column of A, `(n_eq, m)`; what no a can reach is left out."""
@@ -107,7 +134,7 @@ class Map:
     Attributes:
         values: [V, -G], `(N, m)`.
         A: [A_theta, -A_lam], `(r, m)`; in extended precision while it is corrected.
-        T, CZ: the triangle of the cost, and C Z.
+        T, Ct: the triangle of the cost, and C Z T^-1.
         kernel: orthonormal basis of the kernel of the cost in x, `(n_x, n_k)`.
         Eq_pinv: the pseudo-inverse of Eq.
     """
@@ -115,9 +142,31 @@ class Map:
     values: Array
     A: Array
     T: Array
-    CZ: Array
+    Ct: Array
     kernel: Array
     Eq_pinv: Array
+
+    def moved_x(self, slope: Array) -> Array:
+        """Return (T'T)^-1 slope, by how much x is off for a slope of the cost.
+
+        What falls on the kernel of the cost moves no cost, and is left out.
+        """
+        return self._off_kernel(_solve(self.T, self._weighted(slope)))
+
+    def moved_v(self, slope: Array) -> Array:
+        """Return C Z (T'T)^-1 slope, by how much v is off, likewise."""
+        return self.Ct @ (self.T @ self.moved_x(slope) if self.kernel.size else self._weighted(slope))
+
+    def moved_by_rounding(self) -> tuple[Array, Array]:
+        """Return the norms of the rows of C Z (T'T)^-1 and of C Z T^-1, off the kernel, `(N,)` each."""
+        back = self._weighted(self.T.T @ self.Ct.T) if self.kernel.size else self.Ct.T
+        return _norms(self._off_kernel(_solve(self.T, back))), _norms(back)
+
+    def _weighted(self, slope: Array) -> Array:
+        return _solve(self.T, self._off_kernel(slope), is_transposed=True)
+
+    def _off_kernel(self, x: Array) -> Array:
+        return x - self.kernel @ (self.kernel.T @ x) if self.kernel.size else x
 
 
 @dataclass(frozen=True)
@@ -156,45 +205,52 @@ def verify(posed: Posed, found: Map, settings: VerificationSettings = SETTINGS) 
 
 def _check(posed: Posed, found: Map, settings: VerificationSettings) -> Verdict:
     """Check in double precision. An error that a rounding of the data explains is none."""
-    slope, size = posed.slope(found.A)
-    excess = np.abs(found.values - posed.C @ found.A + found.CZ @ _moved(found, slope))
-    own, missed = settings.rounding * np.abs(found.values), np.abs(posed.missed(found.A))
-    of_v, of_eq = (settings.rounding * bound for bound in _rounding(posed, found, size))
-    unexplained = excess > settings.explained * of_v, missed > settings.explained * of_eq
-    error = np.where(unexplained[0], excess, 0.0) + own, np.where(unexplained[1], missed, 0.0)
-    return Verdict(_in_units(posed, found, *error), float(_in_units(posed, found, of_v, of_eq).max(initial=0.0)), None)
+    v = posed.C @ found.A
+    slope, size = posed.slope(found.A, v)
+    excess = np.subtract(found.values, v, out=v)  # arrays of this size are worth reusing
+    excess += found.moved_v(slope)
+    np.abs(excess, out=excess)
+    own, missed = np.abs(found.values), np.abs(posed.missed(found.A))
+    of_v, of_eq = _rounding(posed, found, size, own)
+    of_v *= settings.rounding
+    of_eq *= settings.rounding
+    doubt = float(_in_units(posed, found, of_v, of_eq).max(initial=0.0))
+    of_v *= settings.explained
+    excess *= excess > of_v
+    own *= settings.rounding
+    excess += own
+    missed *= missed > settings.explained * of_eq
+    return Verdict(_in_units(posed, found, excess, missed), doubt, None)
 
 
-def _rounding(posed: Posed, found: Map, size: Array) -> tuple[Array, Array]:
+def _rounding(posed: Posed, found: Map, size: Array, own: Array) -> tuple[Array, Array]:
     """Return what a rounding of every product may do to v, `(N, m)`, and to the equalities, `(n_eq, m)`.
 
     Args:
         posed, found: the problem and its map.
         size: of the terms of the slope, `(m,)`.
+        own: |values|, `(N, m)`.
     """
-    norm = np.linalg.norm
-    back = found.CZ.T
-    if back.size:
-        back = scipy.linalg.solve_triangular(found.T, _off_kernel(found, back), trans="T")
-    length, own = norm(found.A, axis=0), np.abs(found.values)
-    reached = norm(posed.C, axis=1)
+    length, reached = _norms(found.A), _norms(posed.C.T)
+    by_slope, back = found.moved_by_rounding()
     for term in posed.terms:  # a term that is off by its rounding moves v as its target does, which the map says
-        rows = norm(term.S, axis=1)
         if term.start is not None:
-            reached = reached + own[:, term.start : term.start + len(rows)] @ rows
+            reached = reached + own[:, term.start : term.start + len(term.S)] @ _norms(term.S.T)
         else:
             weight = np.einsum("ij,ij->", term.S, term.W @ term.S if term.W.ndim else term.W * term.S)
-            reached = reached + norm(back, axis=0) * np.sqrt(weight)
-    moved = norm(_off_kernel(found, scipy.linalg.solve_triangular(found.T, back)), axis=0)
-    of_eq = norm(posed.Eq, axis=1) / posed.theta_scale[posed.places]
-    return reached[:, None] * length + moved[:, None] * size + own, (of_eq[:, None] + 1) * (length + 1)
+            reached = reached + back * np.sqrt(weight)
+    of_v = np.stack([reached, by_slope], axis=1) @ np.stack([length, size])
+    of_v += own
+    of_eq = _norms(posed.Eq.T) / posed.theta_scale[posed.places]
+    return of_v, (of_eq[:, None] + 1) * (length + 1)
 
 
 def _check_extended(posed: Posed, extended: Posed, found: Map, settings: VerificationSettings) -> Verdict:
     """Check in extended precision."""
     A = found.A.astype(np.longdouble)
-    slope, _ = extended.slope(A)
-    excess = found.values - extended.C @ A + found.CZ @ _moved(found, slope.astype(float))
+    v = extended.C @ A
+    slope, _ = extended.slope(A, v)
+    excess = found.values - v + found.moved_v(slope.astype(float))
     rounding = settings.rounding * np.abs(found.values)  # of values (theta, lam), in every sample
     missed = np.abs(extended.missed(A)).astype(float)
     error = _in_units(posed, found, np.abs(excess).astype(float) + rounding, missed)
@@ -206,28 +262,34 @@ def _corrected(extended: Posed, found: Map) -> Map:
     A = found.A.astype(np.longdouble)
     missed = extended.missed(A).astype(float) * extended.theta_scale[extended.places, None]
     A = A - found.Eq_pinv @ missed
-    slope, _ = extended.slope(A)
-    A = A - extended.Z @ _moved(found, slope.astype(float))
+    slope, _ = extended.slope(A, extended.C @ A)
+    A = A - extended.Z @ found.moved_x(slope.astype(float))
     return replace(found, A=A, values=(extended.C @ A).astype(float))
 
 
-def _moved(found: Map, slope: Array) -> Array:
-    """Return (T'T)^-1 slope, by how much x is off, without what falls on the kernel of the cost: that moves no cost."""
-    if not slope.size:
-        return slope
-    weighted = scipy.linalg.solve_triangular(found.T, _off_kernel(found, slope), trans="T")
-    return _off_kernel(found, scipy.linalg.solve_triangular(found.T, weighted))
-
-
-def _off_kernel(found: Map, x: Array) -> Array:
-    return x - found.kernel @ (found.kernel.T @ x)
-
-
 def _in_units(posed: Posed, found: Map, of_v: Array, of_eq: Array) -> Array:
-    """Return the errors per unit of theta, and per unit of displacement, of v and of the equalities."""
+    """Return errors `(N, m)` and `(n_eq, m)` per unit of theta, and per unit of displacement, `(N + n_eq, 2)`."""
     n_theta = len(posed.theta_scale)
     moved = -np.diagonal(found.values[:, n_theta:]) / posed.scale  # the displacement by a unit of each multiplier
     per_moved = np.divide(1.0, moved, out=np.zeros_like(moved), where=moved > 0)
-    error = np.concatenate([of_v / posed.scale[:, None], of_eq])
-    by_theta = error[:, :n_theta] @ posed.theta_scale
-    return np.stack([by_theta, (error[:, n_theta:] * per_moved).max(axis=1, initial=0.0)], axis=1)
+
+    def in_units(error: Array) -> Array:
+        by_lam = (error[:, n_theta:] * per_moved).max(axis=1, initial=0.0)
+        return np.stack([error[:, :n_theta] @ posed.theta_scale, by_lam], axis=1)
+
+    return np.concatenate([in_units(of_v) / posed.scale[:, None], in_units(of_eq)])
+
+
+def _norms(columns: Array) -> Array:
+    """Return the norm of each column, in double precision."""
+    columns = columns.astype(float, copy=False)
+    norms: Array = np.sqrt(np.einsum("ij,ij->j", columns, columns))
+    return norms
+
+
+def _solve(T: Array, rhs: Array, *, is_transposed: bool = False) -> Array:
+    """Return T^-1 rhs, or T'^-1 rhs, T an upper triangle."""
+    if not rhs.size:
+        return rhs
+    solved: Array = scipy.linalg.solve_triangular(T, rhs, trans=int(is_transposed), check_finite=False)
+    return solved
