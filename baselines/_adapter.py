@@ -143,7 +143,7 @@ def require(module: str, name: str, *, no_deps: bool = False) -> Any:
     try:
         return importlib.import_module(module)
     except ImportError as error:
-        how = "pip install torch_dpc[baselines]"
+        how = "pip install 'torch_dpc[baselines]'"
         if no_deps:
             how += " and then pip install --no-deps qpth (it declares numpy<2, but works with numpy 2)"
         raise ImportError(f"the {name} baseline needs {module}, which cannot be imported ({error}): {how}") from error

@@ -11,7 +11,7 @@ try:
     from rich.console import Console
     from rich.table import Table
 except ImportError:
-    sys.exit("the commands need typer: `pip install torch_dpc[cli]`.")
+    sys.exit("the commands need typer: pip install 'torch_dpc[cli]'.")
 
 import torch
 

@@ -7,6 +7,7 @@ pickles and `state_dict` keep the settings, and leave out what can be computed a
 from __future__ import annotations
 
 import contextlib
+import inspect
 from typing import Any
 
 import torch
@@ -18,7 +19,8 @@ from .data.hankel import HankelData
 from .data.hankel_batch import HankelBatch
 from .factors import Factors
 from .problem.terms import Sizes, Terms
-from .sets import ConvexSet
+from .reprs import shown
+from .sets import ConvexSet, Reals
 from .sets.feasible import FeasibleSet
 from .settings import VALIDATORS, GivenWeights, Settings, Setup
 from .tracing import register
@@ -146,17 +148,27 @@ class ConfiguredModule(nn.Module):
         """
         restore(self, state)
 
-    def extra_repr(self) -> str:
-        """Describe the data and the sizes of the systems that are solved."""
-        sizes = ""
+    def __repr__(self) -> str:
+        """Describe the data, every argument that is not left at its default, and the systems that are solved."""
+        defaults = inspect.signature(type(self)).parameters
+        weights: list[str] = []
+        sets: list[str] = []
+        sizes: list[str] = []
+        for name, value in self.config().items():
+            usual = defaults[name].default
+            if not (value is usual or isinstance(usual, (str, int)) and value == usual or type(value) is Reals):
+                (sets if isinstance(value, ConvexSet) else weights).append(f"{name}={shown(value)}")
         for name in ("reduced_kkt_size", "full_kkt_size"):
             # Settings under change may not fit, and the data sets of a batch may differ: neither has a size to show.
             with contextlib.suppress(ValueError):
-                sizes += f", {name}={getattr(self, name)}"
-        return (
-            f"{self.data!r}{sizes}, "
-            f"backward={self.backward_system!r}, solver={self.solver!r}, on_failure={self.on_failure!r}"
-        )
+                sizes.append(f"{name}={getattr(self, name)}")
+        lines = (repr(self.data), ", ".join(weights), ", ".join(sets), ", ".join(sizes))
+        text = ",\n    ".join(filter(None, lines))
+        return f"{type(self).__name__}({text})"
+
+    def config(self) -> dict[str, Any]:
+        """Return the arguments of the constructor beyond the data, as they are now."""
+        raise NotImplementedError
 
     def __getstate__(self) -> dict[str, Any]:
         """Leave the factors out of copies and pickles: they are made again when needed."""

@@ -199,4 +199,4 @@ def test_without_typer_the_error_says_what_to_install():
     code = "import sys, runpy; sys.modules['typer'] = None; runpy.run_module('torch_dpc', run_name='__main__')"
     done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, timeout=120, check=False)
     assert done.returncode == 1
-    assert "pip install torch_dpc[cli]" in done.stderr
+    assert "pip install 'torch_dpc[cli]'" in done.stderr

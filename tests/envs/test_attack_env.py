@@ -153,7 +153,7 @@ def test_without_gymnasium_the_error_says_what_to_install():
     code = (
         "import sys; sys.modules['gymnasium'] = None\n"
         "try:\n    import torch_dpc.envs\n"
-        "except ImportError as error:\n    assert 'pip install torch_dpc[gym]' in str(error)\n"
+        "except ImportError as error:\n    assert \"pip install 'torch_dpc[gym]'\" in str(error)\n"
         "else:\n    raise SystemExit('no error')"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

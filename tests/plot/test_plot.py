@@ -289,7 +289,7 @@ def test_without_matplotlib_the_error_says_what_to_install():
         "import sys; sys.modules['matplotlib'] = None\n"
         "import torch_dpc\n"
         "try:\n    torch_dpc.plot.log\n"
-        "except ImportError as error:\n    assert 'pip install torch_dpc[plot]' in str(error)\n"
+        "except ImportError as error:\n    assert \"pip install 'torch_dpc[plot]'\" in str(error)\n"
         "else:\n    raise SystemExit('no error')"
     )
     subprocess.run([sys.executable, "-c", code], check=True, timeout=120)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 from ..checks import as_data, check_generator, check_type
+from ..reprs import Described
 from .budgets import Budget
 
 #: How far outside its budget a perturbation may be, relative to the size of the budget: rounding in float64.
@@ -33,7 +34,7 @@ class AttackCall(NamedTuple):
     step: Any
 
 
-class Attack:
+class Attack(Described):
     """A map from what is measured to what is added to it. Write your own by giving `_perturb`.
 
     Args:

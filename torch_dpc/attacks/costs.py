@@ -17,6 +17,7 @@ from ..checks import as_data, as_index, last_rows, to_horizon
 from ..data.hankel import HankelData
 from ..data.predictor import Predictor
 from ..problem.weights import weight_matrix
+from ..reprs import Described, shown
 from ..solution import DPCSolution
 
 #: A cost of a plan, `(*batch,)`; any callable will do.
@@ -72,8 +73,11 @@ class TargetInput:
         """Return psi of a plan made at step 0, `(*batch,)`."""
         return self.at(0)(solution)
 
+    def __repr__(self) -> str:
+        return f"TargetInput({self._name}={shown(self.target)})"
 
-class TrackingError:
+
+class TrackingError(Described):
     """psi = -1/2 |y_true - y_ref|_Q^2: drive the true output away from its reference.
 
     The plan's own y is what the controller was made to believe. y_true is what its inputs will do: the output that the

@@ -13,6 +13,7 @@ from torch import Tensor, nn
 
 from ..checks import as_data, check_callable, check_count, check_type, is_finite, reference, window
 from ..data.hankel import HankelData
+from ..reprs import shown
 from .base import Attack, AttackCall
 from .budgets import BallBudget, Budget, EllipsoidBudget
 
@@ -142,6 +143,12 @@ class AttackPolicy(nn.Module):
             ahead.append(self.context[rows.clamp(max=len(self.context) - 1)])
         return [part.flatten(-2).to(self.scale) for part in (u_ini, y_ini, *ahead)]
 
+    def __repr__(self) -> str:
+        t_ini, horizon, n_u, n_y = self.data_sizes
+        widths = [layer.out_features for layer in self.hidden]
+        count = sum(parameter.numel() for parameter in self.parameters())
+        return f"AttackPolicy({t_ini=}, {horizon=}, {n_u=}, {n_y=}, {widths=}, {count} parameters)"
+
 
 class PolicyAttack(nn.Module, Attack):
     """A network chooses the direction, the budget the size.
@@ -185,6 +192,9 @@ class PolicyAttack(nn.Module, Attack):
         self.policy = policy
         self.budget = budget
         self.reach = reach or ("support" if isinstance(budget, (BallBudget, EllipsoidBudget)) else "projection")
+
+    def __repr__(self) -> str:
+        return f"PolicyAttack({shown(self.policy)}, budget={self.budget}, reach={self.reach!r})"
 
     forward = Attack.__call__
 

@@ -13,6 +13,7 @@ from torch import Tensor
 from .. import plot
 from ..control.controller import DPCController
 from ..control.simulation import simulate
+from ..reprs import Described
 from ..systems.plant import Plant
 from .base import Attack
 from .budgets import RelativeBallBudget
@@ -21,8 +22,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 
-@dataclass(frozen=True, eq=False)
-class RobustnessCurve:
+@dataclass(frozen=True, eq=False, repr=False)
+class RobustnessCurve(Described):
     """The closed-loop error under an attack against its budget.
 
     Attributes:

@@ -11,6 +11,7 @@ from torch import Tensor
 from ..checks import check_count
 from ..control.controller import DPCController
 from ..errors import Status
+from ..reprs import Described
 from ..systems.plant import Port
 from .base import Attack, AttackCall
 from .budgets import Budget
@@ -23,7 +24,7 @@ RunCost = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
 LONGER, SHORTER = 1.5, 0.5
 
 
-class RunError:
+class RunError(Described):
     """psi = -(mean over the steps of |(y - y_ref)[channels]|^2): drive the run away from its reference.
 
     Args:

@@ -110,7 +110,7 @@ class ClosedLoopLog:
         try:
             import pandas
         except ImportError as error:
-            raise ImportError("`to_pandas` needs pandas: pip install torch_dpc[pandas].") from error
+            raise ImportError("`to_pandas` needs pandas: pip install 'torch_dpc[pandas]'.") from error
         log = self.detach()
         columns = {
             f"{name}{i}": values[..., i].reshape(-1).numpy(force=True)
@@ -134,11 +134,18 @@ class ClosedLoopLog:
         runs = f"{tuple(self.batch)} runs, " if self.batch else ""
         dt = float(self.t[1] - self.t[0]) if self.steps > 1 else float("nan")
         summary = self.summary()
+        counts = {status: int((self.status == status).sum()) for status in Status}
         return (
             f"ClosedLoopLog({runs}{self.steps} steps of {dt:g} s, n_u={self.u.shape[-1]}, n_y={self.y.shape[-1]}; "
             f"mean |y - y_ref| {float(summary.mean_error.mean()):.3g}, "
-            f"{100 * float(summary.unsolved.mean()):.3g} % of the steps without a plan of their own)"
+            f"{100 * float(summary.unsolved.mean()):.3g} % of the steps without a plan of their own,\n    "
+            f"u in {_range(self.u)}, y in {_range(self.y)}, largest |p| {float(summary.largest_p.max()):.3g}, "
+            f"status: {', '.join(f'{counts[s]} {s.name}' for s in Status if counts[s])})"
         )
+
+
+def _range(x: Tensor) -> str:
+    return f"[{float(x.detach().min()):.4g}, {float(x.detach().max()):.4g}]"
 
 
 register_fields(ClosedLoopLog)

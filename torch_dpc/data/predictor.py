@@ -8,11 +8,12 @@ import torch
 from torch import Tensor
 
 from ..checks import as_data
+from ..reprs import Described
 from ..shapes import broadcast_shapes
 from .hankel import HankelData
 
 
-class Predictor:
+class Predictor(Described):
     """y = Yf W^+ (u_ini, y_ini, u), W = [Up; Yp; Uf]: the subspace predictor of Favoreel, De Moor, Gevers (1999).
 
     g = W^+ w is the combination of recorded windows that explains w = (u_ini, y_ini, u), least squares and of minimum

@@ -49,6 +49,13 @@ class HankelStream(WindowFactor):
         super().__init__(t_ini=t_ini, horizon=horizon, forgetting=forgetting)
         self._snapshot: tuple[int, HankelData] | None = None  # the windows in it, and the data
 
+    def __repr__(self) -> str:
+        channels = f"n_u={self._n_u}, n_y={self._n_y}" if self._n_u else "no samples"
+        return (
+            f"HankelStream({channels}, t_ini={self.t_ini}, horizon={self.horizon}, forgetting={self.forgetting:g}: "
+            f"{self.n_windows} windows, {self.n_effective:.4g} of them count)"
+        )
+
     @classmethod
     def from_data(cls, data: HankelData, *, forgetting: float = 1.0) -> HankelStream:
         """Go on from recorded data, compact or not, as if its windows weighed 1 each, by a new recording."""

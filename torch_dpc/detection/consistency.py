@@ -12,6 +12,7 @@ from torch import Tensor
 from ..checks import window
 from ..data.hankel import HankelData
 from ..data.recordings import as_recordings, hankel
+from ..reprs import shown
 from ..shapes import broadcast_shapes
 from .cusum import Cusum
 
@@ -31,6 +32,9 @@ class WindowStatistic(NamedTuple):
 
     energy: Tensor
     residual: Tensor
+
+    def __repr__(self) -> str:
+        return f"WindowStatistic(energy={shown(self.energy)}, residual={shown(self.residual)})"
 
 
 class ConsistencyDetector:

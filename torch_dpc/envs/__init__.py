@@ -6,7 +6,7 @@ Importing this module registers "torch_dpc/Quadrotor-v0" with `gymnasium.make`.
 try:
     import gymnasium
 except ImportError as error:
-    raise ImportError("torch_dpc.envs needs Gymnasium: `pip install torch_dpc[gym]`.") from error
+    raise ImportError("torch_dpc.envs needs Gymnasium: pip install 'torch_dpc[gym]'.") from error
 
 from .attack import AttackEnv
 from .quadrotor import QuadrotorEnv

@@ -18,6 +18,7 @@ from ..attacks.budgets import Budget
 from ..checks import check_count
 from ..control.controller import DPCController
 from ..control.references import reference_trajectory
+from ..reprs import shown
 from ..systems.plant import Plant, Port, per_input
 
 Array = NDArray[np.float64]
@@ -109,6 +110,9 @@ class AttackEnv(gymnasium.Env[Array, Array]):
         # Checkers make a second environment from the spec. A function is not copied, so that one shares the plant and
         # the controller: a plant that owns hardware or a physics server has no copy.
         self.spec = EnvSpec("torch_dpc/Attack-v0", entry_point=again)
+
+    def __repr__(self) -> str:
+        return f"AttackEnv({self.plant}, {self.budget}, {shown(self.cost)}, steps={self.steps})"
 
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Begin a run: reset the plant and fill the first window at `u_warmup`.

@@ -65,6 +65,9 @@ class QuadrotorEnv(gymnasium.Env[Array, Array]):
         self.action_space = spaces.Box(-1.0, 1.0, (3,), np.float64)
         self.observation_space = spaces.Box(-UNBOUNDED, UNBOUNDED, (12,), np.float64)
 
+    def __repr__(self) -> str:
+        return f"QuadrotorEnv(target={self.target.tolist()}, {self._plant})"
+
     def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Array, dict[str, Any]]:
         """Put the vehicle at rest around the target, or at `options["position"]`."""
         super().reset(seed=seed)

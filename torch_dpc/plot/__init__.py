@@ -38,7 +38,7 @@ def __getattr__(name: str) -> Any:
     except ModuleNotFoundError as error:
         if (error.name or "").partition(".")[0] != "matplotlib":
             raise
-        raise ImportError("figures need matplotlib: `pip install torch_dpc[plot]`.") from error
+        raise ImportError("figures need matplotlib: pip install 'torch_dpc[plot]'.") from error
 
 
 def __dir__() -> list[str]:

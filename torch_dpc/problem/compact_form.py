@@ -15,6 +15,7 @@ import torch
 from torch import Tensor
 
 from ..data.hankel import HankelData
+from ..reprs import shown
 from .terms import Sizes, Terms
 from .weights import Weights
 
@@ -26,6 +27,9 @@ class CompactForm(NamedTuple):
     q: Tensor
     H: Tensor
     b: Tensor
+
+    def __repr__(self) -> str:
+        return f"CompactForm({', '.join(f'{name}={shown(x)}' for name, x in self._asdict().items())})"
 
 
 def projector(data: HankelData) -> Tensor:

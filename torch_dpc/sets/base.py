@@ -166,3 +166,6 @@ class ConvexSet(nn.Module):
     def config(self) -> dict[str, Any]:
         """Return the arguments that make this set again; tensors are given as they are."""
         raise NotImplementedError(f"{type(self).__name__} does not define `config`, so it cannot be saved.")
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.extra_repr()})"

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from ..autodiff import is_mapped
+from ..reprs import shown
 from .base import ConvexSet
-from .parameters import as_bound, as_tensor, check_order, short
+from .parameters import as_bound, as_tensor, check_order
 
 
 class Box(ConvexSet):
@@ -113,7 +114,7 @@ class Box(ConvexSet):
 
     def extra_repr(self) -> str:
         """Show the bounds."""
-        return f"lower={short(self.lower)}, upper={short(self.upper)}"
+        return f"lower={shown(self.lower)}, upper={shown(self.upper)}"
 
 
 class Reals(Box):
@@ -227,5 +228,5 @@ class SoftBox(ConvexSet):
         return {"lower": self.box.lower, "upper": self.box.upper, "weight": self.weight}
 
     def extra_repr(self) -> str:
-        """Show the price."""
-        return f"weight={short(self.weight)}"
+        """Show the bounds and the price."""
+        return f"{self.box.extra_repr()}, weight={shown(self.weight)}"

@@ -9,8 +9,9 @@ import torch
 from torch import Tensor
 
 from ..autodiff import is_mapped
+from ..reprs import shown
 from .base import ConvexSet
-from .parameters import as_bound, as_tensor, short
+from .parameters import as_bound, as_tensor
 
 
 class Ball(ConvexSet):
@@ -96,8 +97,8 @@ class Ball(ConvexSet):
         return {"radius": self.radius, "center": self.center, "per": self.per}
 
     def extra_repr(self) -> str:
-        """Show the radius."""
-        return f"radius={short(self.radius)}, per={self.per!r}"
+        """Show the ball."""
+        return f"radius={shown(self.radius)}, center={shown(self.center)}, per={self.per!r}"
 
 
 class SecondOrderCone(ConvexSet):

@@ -49,8 +49,3 @@ def check_order(lower: Tensor, upper: Tensor) -> None:
         raise ValueError("`lower` must be at most `upper` in every component, got crossed or NaN bounds.")
     if bool((lower == math.inf).any()) or bool((upper == -math.inf).any()):
         raise ValueError("`lower` must be below +infinity and `upper` above -infinity.")
-
-
-def short(bound: Tensor | float) -> str:
-    """Return a number as it is, a tensor by its shape."""
-    return f"tensor{tuple(bound.shape)}" if isinstance(bound, Tensor) else f"{bound:g}"

@@ -69,6 +69,10 @@ class Product(ConvexSet):
     def config(self) -> dict[str, Any]:
         return {"factors": list(zip(self.factors, self.channels, strict=True))}
 
+    def extra_repr(self) -> str:
+        """Show the factors and their channels."""
+        return ", ".join(f"{owner} on {own}" for owner, own in zip(self.factors, self.channels, strict=True))
+
 
 def _pairs_of(factors: Any) -> list[tuple[ConvexSet, list[int]]]:
     """Return the factors as pairs of a set and the list of its channels."""

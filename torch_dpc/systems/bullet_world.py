@@ -135,11 +135,14 @@ def _import_pybullet() -> ModuleType:
         with _silent_c_output():
             return importlib.import_module("pybullet")
     except ImportError as error:
-        version = f"{sys.version_info.major}.{sys.version_info.minor}"
-        raise ImportError(
-            "the quadrotor needs PyBullet: `pip install torch_dpc[quadrotor]`. "
-            f"PyBullet has wheels only up to Python 3.11; this is Python {version}."
-        ) from error
+        hint = "pip install 'torch_dpc[quadrotor]'."
+        if sys.version_info > (3, 12):
+            version = f"{sys.version_info.major}.{sys.version_info.minor}"
+            hint = (
+                f"it has wheels up to Python 3.11, and this is Python {version}. systems.TorchQuadrotor is the same "
+                "vehicle and needs no PyBullet."
+            )
+        raise ImportError(f"systems.Quadrotor needs PyBullet: {hint}") from error
 
 
 @contextmanager

@@ -122,6 +122,10 @@ class Quadrotor:
         """Whether the physics server was given back."""
         return self._world.closed
 
+    def __repr__(self) -> str:
+        state = "closed" if self.closed else "crashed" if self._crashed else "flying"
+        return f"Quadrotor(gui={self.gui}, {self.physics_hz} Hz, dt={self.dt:g} s): {state}"
+
     def close(self) -> None:
         """Give the physics server back; further calls do nothing."""
         self._world.close()

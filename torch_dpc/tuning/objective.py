@@ -18,6 +18,7 @@ from ..data.predictor import Predictor
 from ..errors import Status
 from ..factors import Factored
 from ..layer import DPCLayer
+from ..reprs import Described
 from .outcome import OutputModel, QuadraticCost, RunCost
 from .scales import WeightScales, base_weight, with_weights
 
@@ -25,8 +26,8 @@ from .scales import WeightScales, base_weight, with_weights
 AttackMaker = Callable[[DPCLayer], Callable[..., Tensor]]
 
 
-@dataclass(frozen=True, eq=False)
-class Windows:
+@dataclass(frozen=True, eq=False, repr=False)
+class Windows(Described):
     """Where the runs that are judged begin.
 
     Attributes:
@@ -50,7 +51,7 @@ class Windows:
             as_data("u_ref", self.u_ref)
 
 
-class RobustObjective:
+class RobustObjective(Described):
     """What a layer with scaled weights costs without and under attack; differentiable in the scales.
 
     Args:

@@ -8,6 +8,7 @@ from typing import Any
 from torch import Tensor
 
 from ..checks import as_data, as_index, check_type
+from ..reprs import Described
 
 #: What inputs do from a window on: (u_ini, y_ini, u) -> y, all `(*batch, steps, n)`. A
 #: :class:`torch_dpc.attacks.Predictor` is one. Its data should not be those of the layer: a layer with a large lambda_g
@@ -17,7 +18,7 @@ OutputModel = Callable[[Tensor, Tensor, Tensor], Tensor]
 RunCost = Callable[[Tensor, Tensor, Tensor, Tensor], Tensor]
 
 
-class MeanError:
+class MeanError(Described):
     """The mean over the steps of |(y - y_ref)[channels]|, in the units of the outputs.
 
     Example:
@@ -43,7 +44,7 @@ class MeanError:
         return ((square + self.SMOOTH**2).sqrt() - self.SMOOTH).mean(-1)
 
 
-class QuadraticCost:
+class QuadraticCost(Described):
     """The mean over the steps of 1/2 |y - y_ref|_Q^2 + 1/2 |u - u_ref|_R^2.
 
     Args:

@@ -11,12 +11,13 @@ import torch
 
 from ..checks import check_callable, check_count, check_number, check_type
 from ..layer import DPCLayer
+from ..reprs import Described
 from .objective import RobustObjective
 from .scales import WeightScales
 
 
-@dataclass(frozen=True, eq=False)
-class TuningResult:
+@dataclass(frozen=True, eq=False, repr=False)
+class TuningResult(Described):
     """What `tune` found.
 
     Attributes:

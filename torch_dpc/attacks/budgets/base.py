@@ -11,6 +11,7 @@ from torch import Tensor
 
 from ... import batching
 from ...checks import as_numbers
+from ...reprs import Described
 
 
 class NormBound(NamedTuple):
@@ -27,7 +28,7 @@ class NormBound(NamedTuple):
     radius: float
 
 
-class Budget:
+class Budget(Described):
     """An admissible set of perturbations p: closed, and with every p it holds s p, 0 <= s <= 1.
 
     Write your own by giving `minimize_linear` and `project`.
@@ -62,10 +63,6 @@ class Budget:
             f"{type(self).__name__} is no intersection of Euclidean norm bounds: take a BallBudget, BoxBudget, "
             "EllipsoidBudget or PerChannelBudget of balls."
         )
-
-    def __repr__(self) -> str:
-        fields = ", ".join(f"{name}={_shown(value)}" for name, value in vars(self).items())
-        return f"{type(self).__name__}({fields})"
 
     def excess(self, p: Tensor, y_ini: Tensor) -> Tensor:
         """Return how far p is outside the set, relative to its size, `(*batch,)`; zero or less when admissible."""
@@ -111,7 +108,3 @@ def nonnegative(name: str, value: Any) -> Tensor:
     if not bool((tensor >= 0).all()) or not bool(torch.isfinite(tensor).all()):
         raise ValueError(f"`{name}` must be finite and not negative, got {value!r}.")
     return tensor
-
-
-def _shown(value: Any) -> str:
-    return str(value.tolist()) if isinstance(value, Tensor) else repr(value)

@@ -60,6 +60,9 @@ class StealthyBudget(Budget):
         self.axes = axes.mT
         self.past: Tensor | None = None  # E_u u_ini, `(*batch, k)`
 
+    def __repr__(self) -> str:
+        return f"StealthyBudget({self.budget}, {self.detector})"
+
     def given(self, u_ini: Tensor) -> StealthyBudget:
         """Return the budget of windows with these inputs."""
         bound = copy.copy(self)

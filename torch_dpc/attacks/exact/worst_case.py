@@ -134,7 +134,7 @@ def worst_case(
     try:
         import clarabel  # noqa: F401  # the convex programs need it; say so before any work
     except ImportError as error:
-        raise ImportError("`worst_case` needs Clarabel: pip install torch_dpc[exact]") from error
+        raise ImportError("`worst_case` needs Clarabel: pip install 'torch_dpc[exact]'.") from error
     if not isinstance(cost, TargetInput):
         raise ValueError(f"`cost` must be a TargetInput, whose psi is convex in the plan, got {type(cost).__name__}.")
     check_type("layer", layer, DPCLayer)
