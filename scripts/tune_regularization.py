@@ -4,12 +4,13 @@
     python -m scripts.tune_regularization --plants masses --quick
 
 lambda_g, lambda_s and the diagonals of Q and R are tuned on recorded windows of three training recordings
-(torch_dpc.tuning), by the gradient and by Optuna at the same processor time. Validation recordings choose one point by
-`QUICK_TRIALS`: no scenario without an attack may get worse. Held-out recordings then judge it by all `TRIALS`
-(scripts/regularization/trials.py): from rest away from the reference, from random starts, pushed, with a changing
-reference, under random noise, Algorithm 1, projected gradient, a black box and a trained policy, each attacker knowing
-the weights. Beside them stands the ridge of study_noise.py on the paper's weights. Rows are saved as they are made; a
-killed run goes on where it stopped (--fresh begins anew; --quick has files of its own). Leaves, in results/:
+(torch_dpc.tuning), by the gradient and by Optuna at the same processor time; and once more on data with the ridge of
+study_noise.py. Validation recordings choose one point of each kind by `QUICK_TRIALS`: no scenario without an attack may
+get worse. Held-out recordings then judge three candidates by all `TRIALS` (scripts/regularization/trials.py): the tuned
+weights, the paper's weights with the ridge, and the weights tuned with the ridge; from rest away from the reference,
+from random starts, pushed, with a changing reference, under random noise, Algorithm 1, projected gradient, a black box
+and a trained policy, each attacker knowing the weights. Rows are saved as they are made; a killed run goes on where it
+stopped (--fresh begins anew; --quick has files of its own). Leaves, in results/:
 
     tuning_{plant}.csv          one row a closed-loop run: mean and largest error [m]
     tuning_{plant}_points.csv   the weights of every point, and what the search that found it cost
@@ -33,29 +34,35 @@ from scripts.experiments.case import Case, Weights
 from scripts.experiments.sensitivity import with_ridge
 from scripts.regularization.objectives import HELD_OUT_FROM, VALIDATION
 from scripts.regularization.picture import draw
-from scripts.regularization.report import HELD_OUT, RIDGE, VALIDATED, choose, write_report
-from scripts.regularization.search import ATTACKED_WEIGHTS, METHODS, ONLY_LAMBDAS, STEPS, Found, searches
+from scripts.regularization.report import HELD_OUT, RIDGE, VALIDATED, candidates, has_ridge, write_report
+from scripts.regularization.search import (
+    ATTACKED_WEIGHTS,
+    GUARDED,
+    METHODS,
+    ONLY_LAMBDAS,
+    RIDGE_SIZE,
+    RIDGED,
+    STEPS,
+    Found,
+    searches,
+)
 from scripts.regularization.trials import QUICK_TRIALS, TRIALS, Trial, run_trials
 from scripts.shared.command import arguments, versions
 from scripts.shared.tables import Table, as_they_finish
 
-LAMBDA_G = (1e0, 1e2, 1e4)
-LAMBDA_S = (1e3, 1e4, 1e5, 1e6)
-RIDGE_SIZE = 1e-2  # of the spread of each output, what study_noise.py recommends
 POINT = ("case", "point", "method", "attacked_weight", "evaluations", "seconds", "total", "lambda_g", "lambda_s")
 COURSE = ("case", "point", "evaluation", "seconds", "nominal", "attacked", "total")
 RUN = ("case", "point", "split", "seed", "trial", "error", "largest", "unsolved")
-GRID_SEEDS = 2  # held-out recordings on which the backdrop is run
 POINTS_A_JOB = 6
 QUICK_STEPS = 5
 
 
 def search_jobs(case: str, methods: Sequence[str]) -> list[tuple[str, float, tuple[str, ...]]]:
-    """Return the searches of one case; those of Optuna follow the one whose time they are given."""
-    timed = tuple(m for m in ("attack", "tpe", "cmaes", "both") if m in methods)
-    jobs: list[tuple[str, float, tuple[str, ...]]] = [(case, 1.0, timed)]
-    jobs += [(case, w, ("attack",)) for w in ATTACKED_WEIGHTS if w != 1.0]
-    return [*jobs, *((case, 1.0, (m,)) for m in ("danskin", ONLY_LAMBDAS) if m in methods)]
+    """Return the searches of one case; that of Optuna follows the one whose time it is given."""
+    timed = tuple(m for m in ("attack", "tpe") if m in methods)
+    jobs: list[tuple[str, float, tuple[str, ...]]] = [(case, 1.0, timed)] if timed else []
+    jobs += [(case, w, ("attack",)) for w in ATTACKED_WEIGHTS if w != 1.0 and "attack" in methods]
+    return [*jobs, *((case, 1.0, (m,)) for m in (GUARDED, RIDGED, "danskin", ONLY_LAMBDAS) if m in methods)]
 
 
 def label(method: str, attacked_weight: float) -> str:
@@ -68,49 +75,36 @@ def search(case: str, attacked_weight: float, methods: tuple[str, ...], steps: i
     return case, searches(case, attacked_weight, methods, steps)
 
 
-def grid(case: Case) -> dict[str, Weights]:
-    """Return the backdrop: the paper's Q and R under other lambdas."""
-    paper = case.paper()
-    return {f"grid {g:g} {s:g}": paper._replace(lambda_g=g, lambda_s=s) for g in LAMBDA_G for s in LAMBDA_S}
-
-
 def run_points(
     case_name: str, split: str, seed: int, points: dict[str, Weights], trials: Sequence[Trial]
 ) -> list[dict[str, Any]]:
-    """Run points in closed loop on one recording; return one row a run. The point `RIDGE` has the ridge in its data."""
+    """Run points in closed loop on one recording; return one row a run."""
     torch.set_num_threads(1)
     case, rows = CASES[case_name], []
     with case.system() as plant:
         u, y = case.record(plant, seed)
         data = case.hankel(u, y)
         for name, weights in points.items():
-            layer = case.layer(with_ridge(data, y, RIDGE_SIZE) if name == RIDGE else data, weights)
+            layer = case.layer(with_ridge(data, y, RIDGE_SIZE) if has_ridge(name) else data, weights)
             keys = {"case": case_name, "point": name, "split": split}
             rows += [keys | row for row in run_trials(case, plant, layer, seed, trials)]
     return rows
 
 
-def run_jobs(case: Case, tuned: dict[str, Weights], seeds: int) -> list[tuple[Any, ...]]:
-    """Return the closed-loop jobs of a case that come before the choice: (case, split, seed, points, trials)."""
-    held_out = range(HELD_OUT_FROM, HELD_OUT_FROM + seeds)
-    jobs: list[tuple[Any, ...]] = []
-
-    def add(split: str, some: Any, points: dict[str, Weights]) -> None:
-        names = list(points)
-        for seed in some:
-            for i in range(0, len(names), POINTS_A_JOB):
-                jobs.append((case.name, split, seed, {n: points[n] for n in names[i : i + POINTS_A_JOB]}, QUICK_TRIALS))
-
-    points = {"paper": case.paper(), **tuned}
-    add(VALIDATED, VALIDATION, points)
-    add(HELD_OUT, held_out, points)
-    add(HELD_OUT, held_out[:GRID_SEEDS], grid(case))
-    return jobs
+def validation_jobs(case: Case, tuned: dict[str, Weights]) -> list[tuple[Any, ...]]:
+    """Return the closed-loop jobs that come before the choice: (case, split, seed, points, trials)."""
+    points = {"paper": case.paper(), RIDGE: case.paper(), **tuned}
+    names = list(points)
+    parts = [names[i : i + POINTS_A_JOB] for i in range(0, len(names), POINTS_A_JOB)]
+    return [
+        (case.name, VALIDATED, seed, {n: points[n] for n in some}, QUICK_TRIALS)
+        for seed in VALIDATION
+        for some in parts
+    ]
 
 
-def judge_jobs(case: Case, chosen: dict[str, Weights], seeds: int) -> list[tuple[Any, ...]]:
-    """Return the jobs that judge the paper's weights, the chosen ones and the ridge by every trial."""
-    points = {"paper": case.paper(), **chosen, RIDGE: case.paper()}
+def judge_jobs(case: Case, points: dict[str, Weights], seeds: int) -> list[tuple[Any, ...]]:
+    """Return the jobs that judge points by every trial on held-out recordings."""
     return [
         (case.name, HELD_OUT, HELD_OUT_FROM + i, {name: weights}, TRIALS)
         for i in range(seeds)
@@ -170,10 +164,10 @@ def tune_plant(
             points.add([{**head, **cost, "total": result.best["total"], **point_columns(result.weights)}])
 
     tuned = {c.name: {r["point"]: weights_of(r) for r in points.rows() if r["case"] == c.name} for c in cases}
-    close_loops(runs, [job for c in cases for job in run_jobs(c, tuned[c.name], seeds)], workers, plant)
-    chosen = {c.name: choose(points.rows(), runs.rows(), c) for c in cases}
-    points_of = {n: {p: tuned[n][p]} if p in tuned[n] else {} for n, p in chosen.items()}
-    jobs = [job for c in cases for job in judge_jobs(c, points_of[c.name], seeds)]
+    close_loops(runs, [job for c in cases for job in validation_jobs(c, tuned[c.name])], workers, plant)
+    known = {c.name: {"paper": c.paper(), RIDGE: c.paper(), **tuned[c.name]} for c in cases}
+    judged = {c.name: ["paper", *candidates(points.rows(), runs.rows(), c)] for c in cases}
+    jobs = [job for c in cases for job in judge_jobs(c, {n: known[c.name][n] for n in judged[c.name]}, seeds)]
     close_loops(runs, jobs, workers, f"{plant}, every trial")
     note = (
         versions(seeds, workers).split(";")[0] + f"; held-out recordings {HELD_OUT_FROM} to {HELD_OUT_FROM + seeds - 1}"

@@ -1,10 +1,10 @@
-"""The searches that tune_regularization.py compares: by the gradient, and by Optuna's samplers at the same budget."""
+"""The searches that tune_regularization.py compares: by the gradient, and by Optuna at the same budget."""
 
 from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import torch
@@ -17,14 +17,15 @@ from torch_dpc import tuning
 STEPS, RATE = 60, 0.4  # of Adam
 LIMIT = math.log(1e3)  # how far each logarithm may move
 ATTACKED_WEIGHTS = (0.3, 1.0, 3.0)
-ONLY_LAMBDAS = "lambdas"
+RIDGE_SIZE = 1e-2  # of the spread of each output, what study_noise.py recommends
+ONLY_LAMBDAS, GUARDED, RIDGED = "lambdas", "guarded", "ridged"
 METHODS = {
+    GUARDED: "gradient, guarded",
+    RIDGED: "gradient, guarded, on data with the ridge",
     "attack": "gradient through the attack",
     "danskin": "gradient with the attack held (Danskin)",
     ONLY_LAMBDAS: "gradient, lambda_g and lambda_s only",
-    "tpe": "Optuna, TPE",
-    "cmaes": "Optuna, CMA-ES",
-    "both": "Optuna, TPE, for half the time, then the gradient",
+    "tpe": "Optuna, TPE, at the same processor time",
 }
 
 
@@ -48,7 +49,7 @@ class Found(NamedTuple):
 
 
 def searches(case_name: str, attacked_weight: float, methods: Sequence[str], steps: int = STEPS) -> list[Found]:
-    """Run several searches one after the other; Optuna's have the processor time that the first one took."""
+    """Run several searches one after the other; Optuna's has the processor time that the first one took."""
     torch.set_num_threads(1)
     case = CASES[case_name]
     found: list[Found] = []
@@ -56,15 +57,13 @@ def searches(case_name: str, attacked_weight: float, methods: Sequence[str], ste
         for method in methods:
             weights = case.paper() if method == ONLY_LAMBDAS else start(case)
             through = "danskin" if method == "danskin" else "attack"
-            goals = objectives(case, plant, weights, attacked_weight=attacked_weight, through=through)
-            if method in ("tpe", "cmaes"):
-                scales, history = by_optuna(goals, method, found[0].seconds)
-            elif method == "both":
-                scales, first = by_optuna(goals, "tpe", found[0].seconds / 2)
-                scales, second = by_gradient(goals, scales, steps // 2)
-                history = [*first, *({**row, "evaluation": len(first) + row["evaluation"]} for row in second)]
-                for row in history[len(first) :]:
-                    row["seconds"] += first[-1]["seconds"]
+            guard: dict[str, Any] = {
+                "guarded": method in (GUARDED, RIDGED),
+                "ridge": RIDGE_SIZE if method == RIDGED else 0.0,
+            }
+            goals = objectives(case, plant, weights, **guard, attacked_weight=attacked_weight, through=through)
+            if method == "tpe":
+                scales, history = by_optuna(goals, found[0].seconds)
             else:
                 scales = tuning.WeightScales(goals[0].layer)
                 for free in (scales.Q, scales.R):
@@ -85,9 +84,9 @@ def by_gradient(
 
 
 def by_optuna(
-    objectives: list[tuning.RobustObjective], sampler: str, seconds: float
+    objectives: list[tuning.RobustObjective], seconds: float
 ) -> tuple[tuning.WeightScales, list[dict[str, float]]]:
-    """Tune by one of Optuna's samplers for so much processor time, its own included, from the same start.
+    """Tune by Optuna's TPE for so much processor time, its own included, from the same start.
 
     The first logarithm of R is left at 0, which takes the common factor out of the search.
     """
@@ -96,10 +95,6 @@ def by_optuna(
     except ImportError as error:
         raise ImportError("the comparison with Optuna needs it: pip install '.[tuning]'") from error
     optuna.logging.set_verbosity(optuna.logging.WARNING)
-    samplers: dict[str, Callable[..., Any]] = {
-        "tpe": lambda: optuna.samplers.TPESampler(seed=0),
-        "cmaes": lambda: optuna.samplers.CmaEsSampler(seed=0, warn_independent_sampling=False),
-    }
     scales = tuning.WeightScales(objectives[0].layer)
     names = [f"s{i}" for i in range(len(scales.vector))]
     pinned = 2 + objectives[0].layer.data.n_y
@@ -121,7 +116,7 @@ def by_optuna(
         if course.seconds() > seconds:
             study.stop()
 
-    study = optuna.create_study(sampler=samplers[sampler]())
+    study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=0))
     study.enqueue_trial({name: 0.0 for i, name in enumerate(names) if i != pinned})
     study.optimize(value, callbacks=[stop])
     set_to(study.best_params)

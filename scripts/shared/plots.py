@@ -22,6 +22,7 @@ from scripts.shared.statistics import BAND, NOMINAL, POISON, RANDOM, band
 RHO_COLOURS = ("#f2a33a", "#c8407a", "#35178c")
 # Okabe and Ito's blue and vermilion.
 COLOURS = {NOMINAL: "black", RANDOM: "#0072b2", POISON: "#d55e00"}
+NOTE_SIZE = 8  # [points], of notes inside the axes and of legends there
 NAMES = {NOMINAL: "no attack", RANDOM: "random noise", POISON: "Algorithm 1"}
 
 
@@ -55,10 +56,23 @@ def draw_band(axes: Axes, x: Array, values: Array, **line: Any) -> None:
     axes.fill_between(x, low, high, color=drawn.get_color(), alpha=0.2, linewidth=0)
 
 
-def say_band(axes: Axes, seeds: int) -> None:
-    """Write inside the axes what lines and bands are."""
-    text = f"median of {seeds} seeds, band: {BAND[0]}th to {BAND[1]}th percentile"
-    axes.text(0.02, 0.97, text, transform=axes.transAxes, va="top", fontsize=8, color="0.3")
+def note(axes: Axes, text: str, corner: str = "upper left") -> None:
+    """Write inside the axes, in a corner, what lines, bands and bars are."""
+    vertical, horizontal = corner.split()
+    x, y = (0.02 if horizontal == "left" else 0.98), (0.98 if vertical == "upper" else 0.02)
+    look: dict[str, Any] = {
+        "va": "top" if vertical == "upper" else "bottom",
+        "ha": horizontal,
+        "fontsize": NOTE_SIZE,
+        "color": "0.3",
+    }
+    box = {"facecolor": "white", "edgecolor": "none", "alpha": 0.7, "pad": 1.5}
+    axes.text(x, y, text, transform=axes.transAxes, bbox=box, zorder=5, **look)
+
+
+def say_band(axes: Axes, seeds: int, corner: str = "upper left") -> None:
+    """Write inside the axes that a line is the median and how wide the band is."""
+    note(axes, f"median of {seeds} seeds, band: {BAND[0]}th to {BAND[1]}th percentile", corner)
 
 
 def percent(rho: float) -> str:

@@ -14,10 +14,13 @@ from scripts.experiments.masses import Masses, MovingTarget
 from scripts.experiments.scenario import AWAY, CHANGING, FIGURE, PUSHED, RANDOM_START, SCENARIOS
 from scripts.regularization import report
 from scripts.regularization import trials as trials_of
-from scripts.regularization.objectives import ATTACKED, objectives
+from scripts.regularization.objectives import ATTACKED, PRICE, objectives
 from scripts.regularization.trials import QUICK_TRIALS, Trial, dominates, verdicts
 from scripts.shared.tables import Table, as_they_finish
 from torch_dpc import tuning
+
+HOLDING = Weights(1e2, 1e6, (1e-6,) * 4, (1e6, 1e6))  # the input stays at its reference whatever is measured
+RIDGE = {"guarded": True, "ridge": 1e-2}
 
 
 def test_a_table_keeps_whole_lines_only(tmp_path):
@@ -39,7 +42,8 @@ def test_every_job_comes_back_whatever_the_number_of_processes():
 
 def test_only_what_is_missing_is_run_again():
     case = CASES["held"]
-    jobs = script.run_jobs(case, {"attack 1": case.paper()}, seeds=2)
+    jobs = script.validation_jobs(case, {"attack 1": case.paper()})
+    jobs += script.judge_jobs(case, {"paper": case.paper(), "attack 1": case.paper()}, seeds=2)
     rows = [(c, n, split, str(s), t.name) for c, split, s, points, trials in jobs for n in points for t in trials]
     assert len(rows) == len(set(rows))  # no run twice
     assert script.missing(jobs, set(rows)) == []
@@ -89,6 +93,22 @@ def test_weights_survive_the_table(tmp_path):
     assert script.weights_of(table.rows()[0]) == weights
 
 
+def test_the_guard_charges_what_the_papers_weights_do_not_cost():
+    """At the paper's weights nothing is above the guard; holding the input costs much in the runs that start away."""
+    case = CASES["held"]
+    with case.system() as plant:
+        (plain, guarded, ridged), holding = (
+            [objectives(case, plant, case.paper(), **options)[0] for options in ({}, {"guarded": True}, RIDGE)],
+            objectives(case, plant, HOLDING, guarded=True)[0],
+        )
+    scales = tuning.WeightScales(plain.layer)
+    values = [{k: float(v.detach()) for k, v in goal(scales).items()} for goal in (plain, guarded, holding)]
+    assert values[0] == pytest.approx(values[1], rel=1e-9)
+    assert values[2]["total"] > values[2]["nominal"] + values[2]["attacked"] + 0.1 * PRICE
+    assert ridged.layer.data.n_g == plain.layer.data.n_g + case.t_ini * plain.layer.data.n_y
+    assert torch.equal(ridged.allowed, guarded.allowed)
+
+
 def rows_of(point, errors, split, seeds=(1, 2, 3, 4)):
     """Rows of the quick trials of one point: the same error in every scenario without an attack, and Algorithm 1's."""
     nominal, attacked = errors
@@ -110,11 +130,22 @@ def test_the_choice_is_never_worse_in_any_scenario():
     away["error"] = "3.0"  # worse in a single scenario
     assert report.choose(points, runs, CASES["moving"]) == "attack 1"
     assert report.choose([], runs, CASES["moving"]) == "paper"
+    growth, trial = report.excess(runs, CASES["moving"], "attack 3")
+    assert trial == away["trial"] and growth > 0.3
+
+
+def test_points_with_the_ridge_are_chosen_apart():
+    points = [{"case": "moving", "point": name, "method": name.split()[0]} for name in ("guarded 1", "ridged 1")]
+    runs = rows_of("paper", (1.0, 2.0), report.VALIDATED) + rows_of("ridge", (0.9, 1.0), report.VALIDATED)
+    runs += rows_of("guarded 1", (1.1, 0.1), report.VALIDATED)  # pays with tracking
+    runs += rows_of("ridged 1", (0.8, 0.9), report.VALIDATED)
+    assert report.choose(points, runs, CASES["moving"]) == "paper"
+    assert report.choose(points, runs, CASES["moving"], ridged=True) == "ridged 1"
+    names = {"ridge": "paper's weights, ridge", "ridged 1": "weights tuned with the ridge"}
+    assert report.candidates(points, runs, CASES["moving"]) == names
 
 
 # --- the judgement ----------------------------------------------------------------------------------------------------
-
-HOLDING = Weights(1e2, 1e6, (1e-6,) * 4, (1e6, 1e6))  # the input stays at its reference whatever is measured
 
 
 def judged_against_the_paper(case, weights, seeds, trials):
@@ -177,12 +208,10 @@ def test_every_attacker_runs_and_the_policy_learns():
 
 
 @pytest.mark.slow
-def test_a_short_run_leaves_its_files_and_is_not_repeated(tmp_path, monkeypatch):
+def test_a_short_run_leaves_its_files_and_is_not_repeated(tmp_path):
     pytest.importorskip("optuna", reason="the comparison needs Optuna: pip install '.[tuning]'")
-    monkeypatch.setattr(script, "LAMBDA_S", (1e4, 1e6))
-    monkeypatch.setattr(script, "LAMBDA_G", (1e2,))
     arguments = ["--plants", "masses", "--quick", "--workers", "1", "--out", str(tmp_path)]
-    arguments += ["--methods", "attack", "tpe"]
+    arguments += ["--methods", "guarded", "ridged", "attack", "tpe"]
     script.main(arguments)
     text = (tmp_path / "tuning_masses_quick.md").read_text()
     assert text.count("| from rest away from the reference, no attack |") == 2 and "Optuna, TPE" in text
