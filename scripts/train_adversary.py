@@ -1,21 +1,22 @@
 """Train adversaries by backprop, a network in place of Algorithm 1, and judge them on what they have not seen.
 
-    python -m scripts.train_adversary --plant masses        # about 1 minute on two cores
-    python -m scripts.train_adversary --plant quadrotor     # about 2 minutes
+    python -m scripts.train_adversary --plant masses        # about 3 minutes on two cores
+    python -m scripts.train_adversary --plant quadrotor     # about 6 minutes
     torchrun --nproc-per-node 2 -m scripts.train_adversary --plant masses       # the same, each batch on two processes
 
 `--mode windows` trains through the layer on windows recorded in closed loop: Algorithm 1's direction is imitated, then
 psi lowered. `--mode closed-loop` goes on from the imitation and makes the error of the whole run large, back through
 every plan and the plant: the masses' own dynamics, or a linear model of the quadrotor fitted to the controller's
-recording. Default is both. A run that was killed goes on where it was when started again; `--restart` begins anew.
+recording. Default is both, each with three training seeds: of the first weights, the recorded runs and the batches. A
+run that was killed goes on where it was when started again; `--restart` begins anew.
 Leaves, in results/:
 
     adversary_{plant}.csv       every comparison: decrease of psi and time on held-out windows, error in closed loop
     adversary_{plant}.md        the same as tables
     adversary_{plant}_training.png, _windows.png, _loop.png     one picture a story
     adversary_{plant}_curves.csv                the training, record by record
-    adversary_{plant}_{mode}.safetensors        the network, and what is needed to go on training
-    adversary_{plant}_recording.safetensors     the windows it is trained on
+    adversary_{plant}_{mode}.safetensors        the network, and what is needed to go on training; _seed1, _seed2 others
+    adversary_{plant}_recording.safetensors     the windows it is trained on; likewise
 """
 
 from __future__ import annotations
@@ -66,6 +67,7 @@ QUICK = {"imitate": 20, "lower": 4, "warm": 20, "loop": 3, "batch": 16, "loops":
 RATE = {"imitate": 3e-3, "lower": 1e-3, "loop": 3e-3}  # of Adam
 LARGEST_GRADIENT = 1.0  # in closed loop, where a few runs may have large ones
 VALIDATED_LOOPS = 8
+TRAINING_SEEDS, QUICK_SEEDS = (0, 1, 2), (0,)
 MODES = (judge.WINDOWS, judge.CLOSED_LOOP)
 
 
@@ -87,12 +89,13 @@ class Training:
         self.plant, self.out, self.size, self.seed, self.workers = judge.PLANTS[plant](), out, size, seed, workers
         self.hidden = hidden
         self.layer = self.plant.planner(TRAINING)
-        self.windows = self._recorded("recording", 1000 * (1 + seed), size["runs"], every_step=True)
+        self.suffix = f"_seed{seed}" if seed else ""
+        self.windows = self._recorded(f"recording{self.suffix}", 1000 * (1 + seed), size["runs"], every_step=True)
         self.held_out = self._recorded("held_out", HELD_OUT, size["kept"], every_step=False)
 
     def checkpoint(self, mode: str) -> Path:
         """Return where a network is kept."""
-        return self.out / f"adversary_{self.plant.plant}_{mode}.safetensors"
+        return self.out / f"adversary_{self.plant.plant}_{mode}{self.suffix}.safetensors"
 
     def forget(self, modes: Sequence[str]) -> None:
         """Delete the checkpoints, by the first process for all."""
@@ -128,12 +131,13 @@ class Training:
             validate = self._validate_loop(policy)
         settings = {"plant": self.plant.plant, "mode": mode, "seed": self.seed, "hidden": list(self.hidden)}
         settings |= {key: self.size[key] for key in ("batch", "loops", "runs")}
-        path, label = self.checkpoint(mode), f"{self.plant.plant}, {mode}"
+        path, label = self.checkpoint(mode), f"{self.plant.plant}, {mode}, seed {self.seed}"
         curve = train(policy, stages, path, settings=settings, validate=validate, label=label)
         before = list(itertools.accumulate((stage.iterations for stage in stages), initial=0))
         return [
             {
                 "mode": mode,
+                "trained": self.seed,
                 "stage": stages[int(stage)].name,
                 "total": before[int(stage)] + iteration,
                 "loss": loss,
@@ -190,22 +194,23 @@ class Training:
         return validate
 
 
-def compare(training: Training, modes: Sequence[str], seeds: int, workers: int) -> list[dict[str, Any]]:
+def compare(trainings: Sequence[Training], modes: Sequence[str], seeds: int, workers: int) -> list[dict[str, Any]]:
     """Return the rows of every comparison, on held-out windows and in closed loop."""
-    plant, paths = training.plant, {mode: training.checkpoint(mode) for mode in modes}
-    policies = judge.load_policies(paths, training.layer)
-    rows = judge.judge_windows(plant, training.layer, training.held_out, policies)
-    jobs = [(plant.plant, setting, seed, paths) for setting in plant.settings for seed in range(seeds)]
+    first = trainings[0]
+    paths = {(mode, training.seed): training.checkpoint(mode) for mode in modes for training in trainings}
+    rows = judge.judge_windows(first.plant, first.layer, first.held_out, judge.load_policies(paths, first.layer))
+    held_out = range(judge.JUDGED_FROM, judge.JUDGED_FROM + seeds)
+    jobs = [(first.plant.plant, setting, seed, paths) for setting in first.plant.settings for seed in held_out]
     runs = [row for job in run_all(judge.judge_run, jobs, workers, "closed loop") for row in job]
     columns = dict.fromkeys(key for row in [*rows, *runs] for key in row)
     return [{key: row.get(key, float("nan")) for key in columns} for row in [*rows, *runs]]
 
 
 def main(argv: list[str] | None = None) -> None:
-    parser = arguments(__doc__, seeds=4)
+    parser = arguments(__doc__, seeds=8)
     parser.add_argument("--plant", choices=sorted(judge.PLANTS), default="masses")
     parser.add_argument("--mode", choices=[*MODES, "all"], default="all")
-    parser.add_argument("--seed", type=int, default=0, help="of weights, recorded runs and batches (default 0)")
+    parser.add_argument("--seed", type=int, nargs="+", help="of weights, recorded runs and batches (default 0 1 2)")
     parser.add_argument("--hidden", type=int, nargs="*", default=HIDDEN, help="width of each hidden layer")
     parser.add_argument("--quick", action="store_true", help="a few iterations and runs, to see that it works")
     parser.add_argument("--restart", action="store_true", help="forget the checkpoints")
@@ -214,25 +219,30 @@ def main(argv: list[str] | None = None) -> None:
     modes = MODES if args.mode == "all" else (args.mode,)
     args.out.mkdir(parents=True, exist_ok=True)
     torch.set_num_threads(1)
-    began = time.perf_counter()
+    began, size = time.perf_counter(), QUICK if args.quick else FULL[args.plant]
     with process_group():
-        training = Training(
-            args.plant, args.out, QUICK if args.quick else FULL[args.plant], args.seed, args.workers, args.hidden
-        )
-        if args.restart:
-            training.forget(modes)
-        curves = [record for mode in modes for record in training.train(mode)]
-        note = f"{versions(args.seeds, args.workers)}; trained with seed {args.seed} on {world()} process(es)"
+        trainings = [
+            Training(args.plant, args.out, size, seed, args.workers, args.hidden)
+            for seed in args.seed or (QUICK_SEEDS if args.quick else TRAINING_SEEDS)
+        ]
+        curves = []
+        for training in trainings:
+            if args.restart:
+                training.forget(modes)
+            curves += [record for mode in modes for record in training.train(mode)]
+        last = judge.JUDGED_FROM + args.seeds - 1
+        note = f"{versions(args.seeds, args.workers).split(';')[0]}; held-out seeds {judge.JUDGED_FROM} to {last}; "
+        note += f"trained with seeds {', '.join(str(t.seed) for t in trainings)} on {world()} process(es)"
         if rank() > 0 or args.no_judging:
             return
 
     name = args.out / f"adversary_{args.plant}"
     write_rows(name.with_name(name.name + "_curves.csv"), curves, note)
-    write_rows(name.with_suffix(".csv"), compare(training, modes, args.seeds, args.workers), note)
+    write_rows(name.with_suffix(".csv"), compare(trainings, modes, args.seeds, args.workers), note)
     rows = read_rows(name.with_suffix(".csv"))
-    write_report(name.with_suffix(".md"), rows, args.plant, training.plant.rhos, note, judge.TIMED_BATCH)
-    pictures(name, rows, read_rows(name.with_name(name.name + "_curves.csv")), training.plant.rhos)
-    print("\n".join(windows_table(rows, training.plant.rhos)))
+    write_report(name.with_suffix(".md"), rows, args.plant, trainings[0].plant.rhos, note, judge.TIMED_BATCH)
+    pictures(name, rows, read_rows(name.with_name(name.name + "_curves.csv")), trainings[0].plant.rhos)
+    print("\n".join(windows_table(rows, trainings[0].plant.rhos)))
     print(f"Adversaries of the {args.plant}: {name.with_suffix('.md')}, {time.perf_counter() - began:.0f} s")
 
 
