@@ -1,11 +1,13 @@
 """Study: how much further attacks of several steps go than Algorithm 1, over every budget; beyond the paper.
 
-    python -m scripts.study_attacks             # about 2 minutes on two cores
-    python -m scripts.study_attacks --quick     # about 30 s: one seed, fewer windows
+    python -m scripts.study_attacks             # about 5 minutes on two cores
+    python -m scripts.study_attacks --quick     # about 30 s: two seeds, fewer windows
 
 The settings of Figures 3 and 4 at their largest rho, on held-out windows of a recording that the controller has not
 seen, for two costs: `TargetInput`, the figure's own, and `TrackingError`, the predicted true output driven away from
-the reference; and in closed loop, with the paper's budget. Leaves, in results/:
+the reference; and in closed loop, with the paper's budget. Shares and differences have 95 % paired bootstrap intervals
+over the seeds. Rows are saved as they are made; a run that is stopped goes on where it was (--fresh and --quick begin
+anew). Leaves, in results/:
 
     attacks.csv                 one row for each plant, seed, cost, budget and attack
     attacks_closed_loop.csv     one row for each plant, seed, cost and attack
@@ -22,15 +24,19 @@ from typing import Any
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 import torch_dpc as dpc
 from scripts.experiments.case import ATTACK_SEED
 from scripts.experiments.surrogates import closed_loop, load, surrogate
-from scripts.shared.command import arguments, run_all, versions
-from scripts.shared.rows import Rows, read_rows, write_rows
+from scripts.shared import bootstrap
+from scripts.shared.command import arguments, versions
+from scripts.shared.rows import Array, Rows, read_rows
+from scripts.shared.tables import Table, as_they_finish, missing
 from torch_dpc import attacks
 
-SEEDS, QUICK_SEEDS = 3, 1
+SEEDS, QUICK_SEEDS = 8, 2
+FIRST_SEED = 8000  # never looked at during development
 WINDOW_EVERY, QUICK_EVERY = 12, 48
 PLANTS = {"masses": "Oscillating masses", "quadrotor": "Quadrotor"}
 STEPS = 20
@@ -54,18 +60,23 @@ BUDGETS = {
 IN_LOOP = (FIRST, "projected gradient", "5 restarts")
 #: The outputs whose error the figures show: what `TrackingError` weighs in closed loop.
 JUDGED = {"masses": torch.tensor([1, 0, 0, 0]), "quadrotor": torch.tensor([1, 1, 1, 0, 0, 0])}
-LOOP_HEAD = """Mean error of the first mass and of the quadrotor's position [m] in the runs of Figures 3 and 4, over the
-seeds, in brackets the extremes; a crashed vehicle counts as lying where it crashed. The tracking error weighs what
-these errors measure. The masses start in perfect tracking, where only a random start has a direction for it."""
+WINDOW = ("plant", "seed", "cost", "budget", "attack", "nominal", "decrease", "worst", "unsolved", "outside", "ms")
+LOOP = ("plant", "seed", "cost", "attack", "error", "crashed")
+LOOP_HEAD = f"""Mean error of the first mass and of the quadrotor's position [m] in the runs of Figures 3 and 4, and
+beside it the difference from {FIRST} on the target input, with its 95 % paired bootstrap interval; a crashed vehicle
+counts as lying where it crashed. The tracking error weighs what these errors measure. The masses start in perfect
+tracking, where only a random start has a direction for it."""
 HEAD = f"""# Attacks of {STEPS} steps against Algorithm 1
 
-Decrease of psi as a share of Algorithm 1's, mean over held-out windows. "Worst window" is the largest psi above
-Algorithm 1's on the same window, over all attacks, as a fraction of psi: rounding of the plans, or nothing. "Outside"
-is the largest excess of any perturbation over its budget, relative to the budget."""
+Decrease of psi as a share of Algorithm 1's: ratio of means over held-out windows and seeds, with 95 % paired bootstrap
+intervals over the seeds. "Worst window" is the largest psi above Algorithm 1's on the same window, over all attacks, as
+a fraction of psi: rounding of the plans, or nothing. "Outside" is the largest excess of any perturbation over its
+budget, relative to the budget."""
 
 
 def run_seed(name: str, seed: int, every: int) -> list[dict[str, Any]]:
     """Return one row for every cost, budget and attack of one seed on one plant."""
+    torch.set_num_threads(1)
     plant = load(name, seed, every)
     layer = surrogate(plant)
     u_ini, y_ini = plant.windows
@@ -96,6 +107,7 @@ def run_seed(name: str, seed: int, every: int) -> list[dict[str, Any]]:
 
 def run_closed_loop(name: str, seed: int) -> list[dict[str, Any]]:
     """Return one row for every cost and attack of one seed, with the paper's budget."""
+    torch.set_num_threads(1)
     plant = load(name, seed, WINDOW_EVERY)
     layer, budget = surrogate(plant), attacks.RelativeBall(plant.rho)
     judged = JUDGED[name].to(torch.float64)
@@ -106,22 +118,29 @@ def run_closed_loop(name: str, seed: int) -> list[dict[str, Any]]:
     rows = []
     for kind, method, attack in runs:
         error, crashed = closed_loop(plant, layer, attack, seed)
-        rows.append({"plant": name, "seed": seed, "cost": kind, "attack": method, "error": error, "crashed": crashed})
+        rows.append({"plant": name, "seed": seed, "cost": kind, "attack": method, "error": error})
+        rows[-1]["crashed"] = int(crashed)
     return rows
 
 
 def closed_loop_table(rows: Rows) -> list[str]:
     """Return the lines of the table of errors in closed loop."""
+
+    def errors(plant: str, kind: str, method: str, column: str = "error") -> Array:
+        mine = (rows["plant"] == plant) & (rows["cost"] == kind) & (rows["attack"] == method)
+        return rows[column][mine][np.argsort(rows["seed"][mine])]
+
     cases = dict.fromkeys(zip(rows["cost"], rows["attack"], strict=True))
-    lines = ["## In closed loop", "", LOOP_HEAD, ""]
-    lines += ["| cost | attack | " + " | ".join(PLANTS.values()) + " |", "|---|---|" + "---|" * len(PLANTS)]
+    head = ["cost", "attack", *(cell for title in PLANTS.values() for cell in (title, f"less {FIRST}'s"))]
+    lines = ["## In closed loop", "", LOOP_HEAD, "", "| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for kind, method in cases:
         cells = [kind, method]
         for plant in PLANTS:
-            chosen = (rows["plant"] == plant) & (rows["cost"] == kind) & (rows["attack"] == method)
-            error, crashes = rows["error"][chosen], int(rows["crashed"][chosen].sum())
-            cells.append(f"{error.mean():.3f} ({error.min():.3f} to {error.max():.3f})")
-            cells[-1] += f", {crashes} of {len(error)} crash" if crashes else ""
+            error, base = errors(plant, kind, method), errors(plant, "target input", FIRST)
+            crashes = int(errors(plant, kind, method, "crashed").sum())
+            cells.append(f"{error.mean():.4f}" + (f", {crashes} of {len(error)} crash" if crashes else ""))
+            is_base = (kind, method) == ("target input", FIRST)
+            cells.append("" if is_base else f"{bootstrap.difference(error, base):+.4f}")
         lines.append("| " + " | ".join(cells) + " |")
     return lines
 
@@ -134,10 +153,9 @@ def table(rows: Rows, plant: str) -> list[str]:
     for kind in dict.fromkeys(rows["cost"]):
         for size in BUDGETS:
             chosen = (rows["plant"] == plant) & (rows["cost"] == kind) & (rows["budget"] == size)
-            of = {name: chosen & (rows["attack"] == name) for name in ATTACKS}
-            decrease = rows["decrease"][of[FIRST]].mean()
-            cells = [kind, size, f"{rows['nominal'][chosen].mean():.3g}", f"{decrease:.3g}"]
-            cells += [f"{100 * rows['decrease'][of[name]].mean() / decrease:.1f} %" for name in more]
+            decrease = {name: _by_seed(rows, chosen & (rows["attack"] == name)) for name in ATTACKS}
+            cells = [kind, size, f"{rows['nominal'][chosen].mean():.3g}", f"{decrease[FIRST].mean():.3g}"]
+            cells += [f"{bootstrap.ratio(decrease[name], decrease[FIRST]).times(100):.1f} %" for name in more]
             cells += [f"{max(rows[column][chosen].max(), 0.0):.0e}" for column in ("worst", "outside")]
             lines.append("| " + " | ".join(cells) + " |")
     speed = {name: np.median(rows["ms"][(rows["plant"] == plant) & (rows["attack"] == name)]) for name in ATTACKS}
@@ -146,24 +164,36 @@ def table(rows: Rows, plant: str) -> list[str]:
     return [*lines, "", f"Median time a window, in batch: {times}. Windows without a plan, left out: {unsolved}."]
 
 
+def _by_seed(rows: Rows, chosen: Array) -> Array:
+    """Return the decrease of psi of each seed, in the order of the seeds."""
+    return rows["decrease"][chosen][np.argsort(rows["seed"][chosen])]
+
+
 def main(argv: list[str] | None = None) -> None:
     parser = arguments(__doc__, seeds=SEEDS)
-    parser.add_argument("--quick", action="store_true", help="one seed and a quarter of the windows")
+    parser.add_argument("--quick", action="store_true", help="two seeds and a quarter of the windows")
+    parser.add_argument("--fresh", action="store_true", help="forget what was measured before")
     args = parser.parse_args(argv)
     out: Path = args.out
     out.mkdir(parents=True, exist_ok=True)
     seeds, every = (QUICK_SEEDS, QUICK_EVERY) if args.quick else (args.seeds, WINDOW_EVERY)
-    began, note = time.perf_counter(), versions(seeds, args.workers)
+    paths, began = (out / "attacks.csv", out / "attacks_closed_loop.csv"), time.perf_counter()
+    if args.fresh or args.quick:
+        for path in paths:
+            path.unlink(missing_ok=True)
+    windows, loops = Table(paths[0], WINDOW), Table(paths[1], LOOP)
 
-    jobs = [(plant, seed, every) for plant in PLANTS for seed in range(seeds)]
-    runs = run_all(run_seed, jobs, args.workers, "Attacks")
-    write_rows(out / "attacks.csv", (row for job in runs for row in job), note)
-    loops = run_all(run_closed_loop, [job[:2] for job in jobs], args.workers, "Closed loop")
-    write_rows(out / "attacks_closed_loop.csv", (row for job in loops for row in job), note)
+    pairs = [(plant, seed) for seed in range(FIRST_SEED, FIRST_SEED + seeds) for plant in PLANTS]
+    jobs: list[tuple[Any, ...]] = [(*pair, every) for pair in missing(windows, pairs)]
+    for found in tqdm(as_they_finish(run_seed, jobs, args.workers), total=len(jobs), desc="Attacks", unit="seed"):
+        windows.add(found)
+    jobs = list(missing(loops, pairs))
+    for found in tqdm(as_they_finish(run_closed_loop, jobs, args.workers), total=len(jobs), desc="Closed loop"):
+        loops.add(found)
 
-    rows = read_rows(out / "attacks.csv")
+    rows, note = read_rows(paths[0]), f"{versions(seeds, args.workers, FIRST_SEED)}"
     body = [line for plant in PLANTS for line in ("", *table(rows, plant))]
-    body += ["", *closed_loop_table(read_rows(out / "attacks_closed_loop.csv"))]
+    body += ["", *closed_loop_table(read_rows(paths[1]))]
     (out / "attacks.md").write_text("\n".join([HEAD, "", f"{note}.", *body]) + "\n")
     print(f"Attacks: {out / 'attacks.md'}, {time.perf_counter() - began:.0f} s")
 

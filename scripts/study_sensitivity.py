@@ -4,7 +4,8 @@
     python -m scripts.study_sensitivity --quick     # about 20 s: two seeds, four rho
 
 The settings of Figures 3 and 4 with rho on a logarithmic grid, for Algorithm 1 and random noise. A run of the masses
-fails when an output leaves its bounds, a flight when the vehicle crashes (it then counts as lying there). Leaves, in
+fails when an output leaves its bounds, a flight when the vehicle crashes (it then counts as lying there). Rows are
+saved as they are made; a run that is stopped goes on where it was (--fresh and --quick begin anew). Leaves, in
 results/:
 
     study_sensitivity.csv   one row a run: mean and largest error, whether and when it failed, plans without a solution
@@ -19,28 +20,35 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
+from tqdm import tqdm
 
 from scripts.experiments.case import Case, run_seed
 from scripts.experiments.masses import Masses
 from scripts.experiments.quadrotor import Quadrotor
-from scripts.shared.command import arguments, run_all, versions
+from scripts.shared import bootstrap
+from scripts.shared.command import arguments, versions
 from scripts.shared.plots import COLOURS, NAMES, draw_band, percent, plt, say_band, style
-from scripts.shared.rows import Array, Rows, grid, read_rows, write_rows
+from scripts.shared.rows import Array, Rows, grid, read_rows
 from scripts.shared.statistics import NOMINAL, POISON, RANDOM, band
+from scripts.shared.tables import Table, as_they_finish, missing
 
 EXPERIMENTS: dict[str, Case] = {"masses": Masses(), "quadrotor": Quadrotor()}
 TITLES = {"masses": "oscillating masses", "quadrotor": "quadrotor"}
 RHO = {"masses": np.logspace(-3, 0, 13), "quadrotor": np.logspace(-4, -1.5, 11)}  # 0.1 to 100 %, 0.01 to 3.2 %
 QUICK_SEEDS, QUICK_EVERY = 2, 4
+ROW = ("plant", "seed", "attack", "rho", "mean_error", "max_error", "failed", "failed_at", "unsolved")
 HEAD = """# Tracking error against rho
 
-Mean error over a run [m]: median over the seeds, in brackets the 10th and the 90th percentile. Where runs fail it says
-little: a crashed vehicle counts as lying where it crashed."""
+Mean error over a run [m]: median over the seeds, in brackets the 10th and the 90th percentile; ratio of means with its
+95 % paired bootstrap interval over the seeds. Where runs fail the error says little: a crashed vehicle counts as lying
+where it crashed."""
 FAILS = {"masses": "an output beyond its bounds", "quadrotor": "a crash"}
 
 
 def run_plant(plant: str, seed: int, rhos: Array) -> list[dict[str, Any]]:
     """Return one row for every run of one seed on one plant."""
+    torch.set_num_threads(1)
     return [
         {
             "plant": plant,
@@ -49,9 +57,9 @@ def run_plant(plant: str, seed: int, rhos: Array) -> list[dict[str, Any]]:
             "rho": run["rho"],
             "mean_error": run["error"].mean(),
             "max_error": run["error"].max(),
-            "failed": bool(failed(run).any()),
+            "failed": int(failed(run).any()),
             "failed_at": run["t"][failed(run).argmax()] if failed(run).any() else np.nan,
-            "unsolved": run["unsolved"][:: EXPERIMENTS[plant].replan_every].sum(),
+            "unsolved": int(run["unsolved"][:: EXPERIMENTS[plant].replan_every].sum()),
         }
         for run in run_seed(EXPERIMENTS[plant], seed, rhos.tolist())
     ]
@@ -66,8 +74,10 @@ def failed(run: dict[str, Any]) -> Array:
 
 
 def of_plant(rows: Rows, plant: str) -> Rows:
-    """Return the rows of one plant."""
-    return {name: column[rows["plant"] == plant] for name, column in rows.items()}
+    """Return the rows of one plant, in the order of the seeds."""
+    chosen = np.flatnonzero(rows["plant"] == plant)
+    order = chosen[np.argsort(rows["seed"][chosen], kind="stable")]
+    return {name: column[order] for name, column in rows.items()}
 
 
 def across(rows: Rows, column: str, attack: str) -> Array:
@@ -119,7 +129,7 @@ def table(rows: Rows, plant: str) -> list[str]:
     for i, rho in enumerate(rhos):
         cells = [percent(rho)]
         cells += ["{:.2g} ({:.2g} to {:.2g})".format(*band(error[attack][:, i])) for attack in (RANDOM, POISON)]
-        cells += [f"{error[POISON][:, i].mean() / error[RANDOM][:, i].mean():.1f}"]
+        cells += [f"{bootstrap.ratio(error[POISON][:, i], error[RANDOM][:, i]):.1f}"]
         cells += [f"{int(fails[attack][:, i].sum())} of {len(fails[attack])}" for attack in (RANDOM, POISON)]
         lines.append("| " + " | ".join(cells) + " |")
     return lines + ["", *(f"- {NAMES[attack]}: {first_failure(rhos, fails[attack])}" for attack in (RANDOM, POISON))]
@@ -137,17 +147,22 @@ def first_failure(rhos: Array, failed: Array) -> str:
 def main(argv: list[str] | None = None) -> None:
     parser = arguments(__doc__)
     parser.add_argument("--quick", action="store_true", help="two seeds and every fourth rho")
+    parser.add_argument("--fresh", action="store_true", help="forget what was measured before")
     args = parser.parse_args(argv)
     out: Path = args.out
     out.mkdir(parents=True, exist_ok=True)
     seeds, every = (QUICK_SEEDS, QUICK_EVERY) if args.quick else (args.seeds, 1)
-    began, note = time.perf_counter(), versions(seeds, args.workers)
+    path, began = out / "study_sensitivity.csv", time.perf_counter()
+    if args.fresh or args.quick:
+        path.unlink(missing_ok=True)
+    measured = Table(path, ROW)
 
-    jobs = [(plant, seed, RHO[plant][::every]) for plant in EXPERIMENTS for seed in range(seeds)]
-    runs = run_all(run_plant, jobs, args.workers, "Sensitivity")
-    write_rows(out / "study_sensitivity.csv", (run for job in runs for run in job), note)
+    pairs = [(plant, seed) for seed in range(seeds) for plant in EXPERIMENTS]
+    jobs = [(plant, seed, RHO[plant][::every]) for plant, seed in missing(measured, pairs)]
+    for runs in tqdm(as_they_finish(run_plant, jobs, args.workers), total=len(jobs), desc="Sensitivity", unit="seed"):
+        measured.add(runs)
 
-    rows = read_rows(out / "study_sensitivity.csv")
+    rows, note = read_rows(path), versions(seeds, args.workers)
     plot(out / "study_sensitivity.png", rows)
     body = [line for plant in EXPERIMENTS for line in ("", *table(of_plant(rows, plant), plant))]
     (out / "study_sensitivity.md").write_text("\n".join([HEAD, "", f"{note}.", *body]) + "\n")

@@ -33,7 +33,7 @@ from tqdm import tqdm
 
 import torch_dpc as dpc
 from scripts.experiments.masses import Masses
-from scripts.experiments.stream_adaptation import CHANGE, FORGETTINGS, plot, track
+from scripts.experiments.stream_adaptation import CHANGE, FORGETTINGS, SEEDS, plot, track
 from scripts.shared.command import arguments, versions
 from scripts.shared.rows import Array
 
@@ -159,10 +159,10 @@ def files(name: str, n_g: int) -> dict[str, float]:
     return out
 
 
-def adaptation(forgetting: float) -> dict[str, float]:
+def adaptation(forgetting: float, seed: int) -> dict[str, float]:
     """Return the error [m] at each step of a run in which the plant changes; forgetting 0 stands for fixed data."""
     torch.set_num_threads(1)
-    return {f"error {k}": error for k, error in enumerate(track(forgetting))}
+    return {f"error {k}": error for k, error in enumerate(track(forgetting, seed))}
 
 
 def in_a_process(function: Callable[..., dict[str, float]], given: tuple[Any, ...]) -> dict[str, float]:
@@ -192,7 +192,13 @@ def jobs(quick: bool) -> list[tuple[Callable[..., dict[str, float]], tuple[Any, 
     listed += [(stream, (name, samples // share)) for name, lengths in SAMPLES.items() for samples in lengths]
     listed += [(updates, (name, UPDATES)) for name in SAMPLES]
     listed += [(files, (name, n_g)) for name in SAMPLES for n_g in (N_G[:1] if quick else N_G)]
-    return listed + [(adaptation, (forgetting,)) for forgetting in FORGETTINGS]
+    return listed + [(adaptation, (forgetting, seed)) for forgetting in FORGETTINGS for seed in range(SEEDS)]
+
+
+def errors_of(done: dict[tuple[str, str], dict[str, float]]) -> dict[float, Array]:
+    """Return the errors when the plant changes, `(seeds, steps)`, by the forgetting."""
+    keys = {f: [("adaptation", json.dumps([f, seed])) for seed in range(SEEDS)] for f in FORGETTINGS}
+    return {f: np.array([list(done[key].values()) for key in some]) for f, some in keys.items()}
 
 
 def tables(done: dict[tuple[str, str], dict[str, float]], note: str) -> str:
@@ -210,14 +216,12 @@ def tables(done: dict[tuple[str, str], dict[str, float]], note: str) -> str:
                   for name, row in rows]  # fmt: skip
         lines.append("")
     spans = {"10 s before": (-100, 0), "10 s after": (0, 100), "10 to 30 s": (100, 300), "60 to 80 s": (600, 800)}
-    lines += ["## The plant changes", "", "Mean distance to the reference around the change [m].", ""]
+    lines += ["## The plant changes", "", f"Mean distance to the reference around the change [m], {SEEDS} seeds.", ""]
     lines += ["| data | " + " | ".join(spans) + " |", "|---|" + "---:|" * len(spans)]
-    for (of, key), row in done.items():
-        if of == "adaptation":
-            error, (forgetting,) = np.array(list(row.values())), json.loads(key)
-            name = f"updated, forgetting {forgetting}" if forgetting else "fixed"
-            means = [error[CHANGE + first : CHANGE + last].mean() for first, last in spans.values()]
-            lines.append(f"| {name} | " + " | ".join(f"{mean:.4f}" for mean in means) + " |")
+    for forgetting, error in errors_of(done).items():
+        name = f"updated, forgetting {forgetting}" if forgetting else "fixed"
+        means = [error[:, CHANGE + first : CHANGE + last].mean() for first, last in spans.values()]
+        lines.append(f"| {name} | " + " | ".join(f"{mean:.4f}" for mean in means) + " |")
     return "\n".join(lines) + "\n"
 
 
@@ -244,8 +248,7 @@ def main(argv: list[str] | None = None) -> None:
             csv.writer(file).writerows([*key, quantity, repr(value)] for quantity, value in done[key].items())
     chosen = {key: done[key] for _, _, key in wanted}
     (args.out / "stream.md").write_text(tables(chosen, versions(1, 1)))
-    errors = {f: list(chosen["adaptation", json.dumps([f])].values()) for f in FORGETTINGS}
-    plot(args.out / "stream_adaptation.png", errors)
+    plot(args.out / "stream_adaptation.png", errors_of(chosen))
     print(f"Stream study: {args.out / 'stream.md'}")
 
 

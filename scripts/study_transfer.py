@@ -1,16 +1,17 @@
 """Study: how much of an attack survives when the attacker does not know the controller; beyond the paper.
 
-    python -m scripts.study_transfer            # about 2 minutes on two cores
-    python -m scripts.study_transfer --quick    # about 20 s: one seed, fewer windows
+    python -m scripts.study_transfer            # about 3 minutes on two cores
+    python -m scripts.study_transfer --quick    # about 30 s: two seeds, fewer windows
 
 The settings of Figures 3 and 4 at their largest rho. The attacker plans p on a surrogate, a layer with other data,
 weights or horizon than the controller's, or asks the controller itself for its inputs, so many windows at a time. What
 counts is the controller's answer: the decrease of psi on windows of a recording that neither has seen, as a share of
 that of Algorithm 1 with full knowledge, and on the masses the tracking error in closed loop. Every seed has a
-controller, an attacker's recording and held-out windows of its own. Leaves, in results/:
+controller, an attacker's recording and held-out windows of its own. Rows are saved as they are made; a run that is
+stopped goes on where it was (--fresh and --quick begin anew). Leaves, in results/:
 
     transfer.csv    one row for each plant, seed and attack
-    transfer.png    shares: the mean over the seeds and their range
+    transfer.png    shares with 95 % paired bootstrap intervals over the seeds
     transfer.md     the same as tables
 """
 
@@ -24,15 +25,20 @@ from typing import Any
 
 import numpy as np
 import torch
+from tqdm import tqdm
 
 import torch_dpc as dpc
 from scripts.experiments.case import ATTACK_SEED
 from scripts.experiments.surrogates import SURROGATES, Plant, closed_loop, load, surrogate
-from scripts.shared.command import arguments, run_all, versions
+from scripts.shared import bootstrap
+from scripts.shared.command import arguments, versions
+from scripts.shared.plots import note as write_note
 from scripts.shared.plots import plt, style
-from scripts.shared.rows import Array, Rows, read_rows, write_rows
+from scripts.shared.rows import Array, Rows, read_rows
+from scripts.shared.tables import Table, as_they_finish, missing
 
-SEEDS, QUICK_SEEDS = 5, 1
+SEEDS, QUICK_SEEDS = 8, 2
+FIRST_SEED = 8500  # never looked at during development
 WINDOW_EVERY, QUICK_EVERY = 12, 48  # steps between held-out windows
 PLANTS = ("masses", "quadrotor")
 ONE_STEP, MORE_STEPS = "Algorithm 1", "projected gradient"
@@ -49,11 +55,12 @@ GROUPS |= {"past": "other horizon or past", "Q": "other Q", "all of it": "all of
 HEAD = """# How much of an attack survives partial knowledge
 
 Shares of what Algorithm 1 with full knowledge does: of its decrease of psi on held-out windows, and on the masses of
-its mean tracking error in closed loop. Mean over the seeds, in brackets the extremes. The attacker plans on a surrogate
-that differs from the controller as the line says, or knows nothing and asks the controller for its inputs. Noise is
-relative to the spread of each output; with all of it off the surrogate has another recording with 1 % of noise, horizon
-20, lambda_s / 10, lambda_g x 10 and Q / 2. The cosine is that between the attacker's p, of one step, and Algorithm 1's
-with full knowledge."""
+its mean tracking error in closed loop. Ratios of means over the seeds, in brackets their 95 % paired bootstrap
+intervals. The attacker plans on a surrogate that differs from the controller as the line says, or knows nothing and
+asks the controller for its inputs. Noise is relative to the spread of each output; with all of it off the surrogate has
+another recording with 1 % of noise, horizon 20, lambda_s / 10, lambda_g x 10 and Q / 2. The cosine is that between the
+attacker's p, of one step, and Algorithm 1's with full knowledge."""
+ROW = ("plant", "seed", "kind", "knows", "method", "queries", "cosine", "psi", "decrease", "unsolved", "error")
 
 
 def attackers(plant: Plant, victim: dpc.DPCLayer, seed: int) -> Iterator[tuple[str, str, str, Any]]:
@@ -75,6 +82,7 @@ def attackers(plant: Plant, victim: dpc.DPCLayer, seed: int) -> Iterator[tuple[s
 
 def run_seed(name: str, seed: int, every: int) -> list[dict[str, Any]]:
     """Return one row for every attack of one seed on one plant."""
+    torch.set_num_threads(1)
     plant = load(name, seed, every)
     victim = surrogate(plant)
     u_ini, y_ini = plant.windows
@@ -97,15 +105,26 @@ def run_seed(name: str, seed: int, every: int) -> list[dict[str, Any]]:
         row |= {"queries": queries, "cosine": cosine}  # with Algorithm 1's p under full knowledge
         row |= {"psi": float(nominal.mean()), "decrease": decrease, "unsolved": int((~solved).sum()), "error": error}
         rows.append(row)
-    full = next(row for row in rows if (row["knows"], row["method"]) == (FULL, ONE_STEP))
-    shares = (("share", "decrease"), ("error_share", "error"))
-    return [row | {share: row[of] / full[of] for share, of in shares} for row in rows]
+    return rows
 
 
 def pick(rows: Rows, plant: str, knows: str, method: str, column: str) -> Array:
-    """Return a column over the seeds."""
+    """Return a column over the seeds, in their order."""
     chosen = (rows["plant"] == plant) & (rows["knows"] == knows) & (rows["method"] == method)
-    return rows[column][chosen]
+    return rows[column][chosen][np.argsort(rows["seed"][chosen])]
+
+
+def share(rows: Rows, plant: str, knows: str, method: str, column: str) -> bootstrap.Interval | None:
+    """Return a column as a share of Algorithm 1's with full knowledge [%]; None where it was not measured."""
+    values, full = pick(rows, plant, knows, method, column), pick(rows, plant, FULL, ONE_STEP, column)
+    if not (len(values) and np.isfinite(values).all()):
+        return None
+    return bootstrap.ratio(values, full).times(100)
+
+
+def cell(found: bootstrap.Interval | None) -> str:
+    """Return a share in percent with its interval."""
+    return "-" if found is None else "{:.0f} % ({:.0f} to {:.0f})".format(*(number + 0.0 for number in found[:3]))
 
 
 def cases(rows: Rows, plant: str) -> list[tuple[str, str, list[str]]]:
@@ -116,14 +135,6 @@ def cases(rows: Rows, plant: str) -> list[tuple[str, str, list[str]]]:
         if method not in methods:
             methods.append(method)
     return [(kind, knows, methods) for knows, (kind, methods) in seen.items()]
-
-
-def share(values: Array) -> str:
-    """Return the mean over the seeds in percent and, in brackets, the extremes."""
-    if not np.isfinite(values).all():
-        return "-"
-    mean, low, high = (round(100 * float(value)) for value in (values.mean(), values.min(), values.max()))
-    return f"{mean} % ({low} to {high})"
 
 
 def table(rows: Rows, plant: str) -> list[str]:
@@ -139,12 +150,11 @@ def table(rows: Rows, plant: str) -> list[str]:
         first = methods[0]
         cells = [knows, f"{pick(rows, plant, knows, first, 'queries').mean():.0f}"]
         cells += [f"{pick(rows, plant, knows, first, 'cosine').mean():.2f}"]
-        cells += [share(pick(rows, plant, knows, first, "share"))]
-        cells += [share(pick(rows, plant, knows, MORE_STEPS, "share")) if MORE_STEPS in methods else "-"]
-        cells += [share(pick(rows, plant, knows, first, "error_share"))] * has_error
+        cells += [cell(share(rows, plant, knows, method, "decrease")) for method in (first, MORE_STEPS)]
+        cells += [cell(share(rows, plant, knows, first, "error"))] * has_error
         lines.append("| " + " | ".join(cells) + " |")
     if has_error:
-        more = share(pick(rows, plant, FULL, MORE_STEPS, "error_share"))
+        more = cell(share(rows, plant, FULL, MORE_STEPS, "error"))
         lines += ["", f"In closed loop projected gradient with full knowledge makes {more} of Algorithm 1's error."]
     return [*lines, "", f"Windows without a plan, left out: {int(rows['unsolved'][rows['plant'] == plant].sum())}."]
 
@@ -175,20 +185,19 @@ def plot(path: Path, rows: Rows) -> None:
                 axes.axhline(place - 1.5, color="0.8", linewidth=0.6)
     for axes, plant in zip(panels, PLANTS, strict=True):
         for place, (_, knows, methods) in zip(places, lines, strict=True):
-            drawn = [(methods[0], "share", -0.25), (MORE_STEPS, "share", 0.0), (methods[0], "error_share", 0.25)]
+            drawn = [(methods[0], "decrease", -0.25), (MORE_STEPS, "decrease", 0.0), (methods[0], "error", 0.25)]
             for (method, column, shift), (marker, colour) in zip(drawn, LOOKS.values(), strict=True):
-                values = 100 * pick(rows, plant, knows, method, column)
-                if len(values) and np.isfinite(values).all():
-                    axes.hlines(place + shift, values.min(), values.max(), color=colour, linewidth=1.2, alpha=0.6)
-                    axes.plot(values.mean(), place + shift, marker, color=colour, markersize=4)
+                found = share(rows, plant, knows, method, column)
+                if found is not None:
+                    axes.hlines(place + shift, found.low, found.high, color=colour, linewidth=1.2)
+                    axes.plot(found.value, place + shift, marker, color=colour, markersize=4)
         axes.axvline(100, color="black", linewidth=0.8, linestyle=(0, (4, 2)))
         axes.axvline(0, color="black", linewidth=0.8)
         axes.set_title(TITLES[plant])
     names = [knows.replace("lambda", r"$\lambda$").replace(" x ", " × ") for _, knows, _ in lines]
     panels[0].set_yticks(places, [re.sub(r"\$_(\w)", r"_\1$", name) for name in names])
-    seeds = len(np.unique(rows["seed"]))
-    text = f"share of what Algorithm 1 does with full knowledge [%]; mean and range of {seeds} seeds"
-    figure.supxlabel(text, fontsize=10)
+    figure.supxlabel("share of what Algorithm 1 does with full knowledge [%]", fontsize=10)
+    write_note(panels[0], f"{len(np.unique(rows['seed']))} seeds, bars: 95 %\npaired bootstrap interval", "lower right")
     panels[0].set_ylim(places[-1] + 0.5, -0.6)
     for name, (marker, colour) in LOOKS.items():
         panels[0].plot([], [], marker, color=colour, markersize=4, label=name)
@@ -199,18 +208,23 @@ def plot(path: Path, rows: Rows) -> None:
 
 def main(argv: list[str] | None = None) -> None:
     parser = arguments(__doc__, seeds=SEEDS)
-    parser.add_argument("--quick", action="store_true", help="one seed and a quarter of the windows")
+    parser.add_argument("--quick", action="store_true", help="two seeds and a quarter of the windows")
+    parser.add_argument("--fresh", action="store_true", help="forget what was measured before")
     args = parser.parse_args(argv)
     out: Path = args.out
     out.mkdir(parents=True, exist_ok=True)
     seeds, every = (QUICK_SEEDS, QUICK_EVERY) if args.quick else (args.seeds, WINDOW_EVERY)
-    began, note = time.perf_counter(), versions(seeds, args.workers)
+    path, began = out / "transfer.csv", time.perf_counter()
+    if args.fresh or args.quick:
+        path.unlink(missing_ok=True)
+    measured = Table(path, ROW)
 
-    jobs = [(plant, seed, every) for plant in PLANTS for seed in range(seeds)]
-    runs = run_all(run_seed, jobs, args.workers, "Transfer")
-    write_rows(out / "transfer.csv", (row for job in runs for row in job), note)
+    pairs = [(plant, seed) for seed in range(FIRST_SEED, FIRST_SEED + seeds) for plant in dict.fromkeys(PLANTS)]
+    jobs = [(*pair, every) for pair in missing(measured, pairs)]
+    for found in tqdm(as_they_finish(run_seed, jobs, args.workers), total=len(jobs), desc="Transfer", unit="seed"):
+        measured.add(found)
 
-    rows = read_rows(out / "transfer.csv")
+    rows, note = read_rows(path), versions(seeds, args.workers, FIRST_SEED)
     plot(out / "transfer.png", rows)
     body = [line for plant in PLANTS for line in ("", *table(rows, plant))]
     (out / "transfer.md").write_text("\n".join([HEAD, "", f"{note}.", *body]) + "\n")

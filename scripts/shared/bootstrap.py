@@ -45,6 +45,10 @@ class Interval(NamedTuple):
     def __str__(self) -> str:
         return format(self, "")
 
+    def times(self, factor: float) -> Interval:
+        """Return the interval in another unit, such as percent."""
+        return Interval(factor * self.value, factor * self.low, factor * self.high, self.seeds)
+
 
 def interval(statistic: Callable[..., Array], *samples: Array) -> Interval:
     """Return a statistic of paired samples, `(seeds,)` each, with its interval.

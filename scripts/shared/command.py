@@ -60,10 +60,10 @@ def run_all(function: Callable[..., Any], jobs: Sequence[tuple[Any, ...]], worke
     return results
 
 
-def versions(seeds: int, workers: int) -> str:
-    """Return one line: package versions, seeds, processes and threads."""
+def versions(seeds: int, workers: int, first: int = 0) -> str:
+    """Return one line: package versions, seeds from the first on, processes and threads."""
     return (
         f"torch_dpc {dpc.__version__}, torch {torch.__version__}, numpy {np.__version__}, "
-        f"Python {platform.python_version()}; seeds 0 to {seeds - 1}; "
+        f"Python {platform.python_version()}; seeds {first} to {first + seeds - 1}; "
         f"{min(workers, seeds)} processes of 1 thread"
     )

@@ -36,6 +36,12 @@ class Table:
             return list(csv.DictReader(file))
 
 
+def missing(table: Table, pairs: Sequence[tuple[str, int]]) -> list[tuple[str, int]]:
+    """Return the pairs of plant and seed that have no rows yet."""
+    done = {(row["plant"], int(row["seed"])) for row in table.rows()}
+    return [pair for pair in pairs if pair not in done]
+
+
 def as_they_finish(function: Any, jobs: Sequence[tuple[Any, ...]], workers: int) -> Iterator[Any]:
     """Yield `function(*job)` of every job in the order in which they finish, one process a worker."""
     if workers <= 1 or len(jobs) <= 1:
