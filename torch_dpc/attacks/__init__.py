@@ -19,9 +19,11 @@ from .costs import Cost, TargetInput, TrackingError
 from .ensemble import Ensemble
 from .exact import WorstCase, worst_case
 from .gradient import FrankWolfeAttack, LinearizedAttack, ProjectedGradientAttack
+from .influence import weigh_windows, window_influence
 from .policy import AttackPolicy, PolicyAttack
 from .query import FiniteDifferenceAttack, RandomSearchAttack
 from .random import RandomAttack
+from .recording import Poisoned, PoisonedRecording
 from .robustness import RobustnessCurve, robustness_curve
 from .signal import RunError, SignalAttack
 
@@ -51,6 +53,8 @@ __all__ = [
     "PerChannelBudget",
     "PerSampleBudget",
     "Planner",
+    "Poisoned",
+    "PoisonedRecording",
     "PolicyAttack",
     "Predictor",
     "ProjectedGradientAttack",
@@ -71,5 +75,7 @@ __all__ = [
     "WorstCase",
     "robustness_curve",
     "sensitivity_bound",
+    "weigh_windows",
+    "window_influence",
     "worst_case",
 ]
