@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 import operator
+import warnings
 from collections.abc import Iterable, Sequence
 from typing import Any
 
@@ -11,16 +12,35 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from .autodiff import is_mapped
 from .shapes import broadcast_shapes
 
+#: What to write in place of an object that is easily taken for another, by argument and class (or one of its bases).
+CURES = {
+    ("budget", "ConvexSet"): "a set bounds plans; attacks.BoxBudget or attacks.BallBudget bounds perturbations",
+    ("budget", "float"): "attacks.RelativeBallBudget(0.1) is 10 % of the measured window, for instance",
+    ("controller", "DPCLayer"): "give DPCController(layer)",
+    ("layer", "DPCController"): "give controller.layer",
+    ("attack", "Budget"): "give an attack within it, for instance attacks.RandomAttack(budget)",
+    ("set", "Budget"): "a budget bounds perturbations; Box or Ball bounds plans",
+    ("set", "tuple"): "give Box(lower, upper)",
+}
 
-def as_data(name: str, value: Any, *, finite: bool = True) -> Tensor:
+
+def cure(name: str, value: Any) -> str:
+    """Return what to write in place of a value, `: ...`; nothing if there is nothing to say."""
+    kinds = (CURES.get((name, kind.__name__)) for kind in type(value).__mro__)
+    return next((f": {text}" for text in kinds if text), "")
+
+
+def as_data(name: str, value: Any, *, finite: bool = True, integers: bool = False) -> Tensor:
     """Return floating data as a tensor; a tensor passes as it is, with its graph.
 
     Args:
         name: what the caller calls it; the error says so.
         value: a floating tensor, a NumPy float array, or a nested list of floats.
         finite: refuse NaN and infinity.
+        integers: admit Python integers, alone or in lists: references and targets that are typed by hand.
 
     Raises:
         ValueError: integer, boolean or complex values, ragged lists, or values that are not finite.
@@ -32,11 +52,15 @@ def as_data(name: str, value: Any, *, finite: bool = True) -> Tensor:
             array = np.asarray(value)
         except ValueError as error:
             raise ValueError(f"`{name}` must be a rectangular array of floats: {error}") from error
+        if integers and array.dtype.kind in "iu" and not isinstance(value, (np.ndarray, np.generic)):
+            array = array.astype(np.float64)
         if not np.issubdtype(array.dtype, np.floating):
-            raise ValueError(f"`{name}` must hold floating-point numbers, got {array.dtype}.")
+            hint = " Write 1.0 for 1, or x.astype(float)." if array.dtype.kind in "iu" else ""
+            raise ValueError(f"`{name}` must hold floating-point numbers, got {array.dtype}.{hint}")
         tensor = torch.as_tensor(array)
     if not tensor.is_floating_point():
-        raise ValueError(f"`{name}` must hold floating-point numbers, got {tensor.dtype}.")
+        hint = "" if tensor.is_complex() or tensor.dtype is torch.bool else f" Give {name}.double()."
+        raise ValueError(f"`{name}` must hold floating-point numbers, got {tensor.dtype}.{hint}")
     if finite and not is_finite(tensor):
         bad = int((~torch.isfinite(tensor.detach())).sum())
         raise ValueError(f"`{name}` must be finite, got {bad} NaN or infinite of {tensor.numel()} values.")
@@ -127,7 +151,7 @@ def check_type(name: str, value: Any, kind: type[Any] | tuple[type[Any], ...]) -
         kinds = kind if isinstance(kind, tuple) else (kind,)
         wanted = " or ".join(k.__name__ for k in kinds)
         came = f"the class {value.__name__}: make an object of it" if isinstance(value, type) else type(value).__name__
-        raise ValueError(f"`{name}` must be a {wanted}, got {came}.")
+        raise ValueError(f"`{name}` must be a {wanted}, got {came}{cure(name, value)}.")
 
 
 def check_generator(value: Any) -> None:
@@ -154,7 +178,8 @@ def check_batch(name: str, value: Any) -> tuple[int, ...]:
 def check_callable(name: str, value: Any, *, optional: bool = False) -> None:
     """Raise ValueError unless a value can be called, or is None where that is admitted."""
     if not callable(value) and not (optional and value is None):
-        raise ValueError(f"`{name}` must be callable{' or None' if optional else ''}, got {type(value).__name__}.")
+        kind = f"callable{' or None' if optional else ''}"
+        raise ValueError(f"`{name}` must be {kind}, got {type(value).__name__}{cure(name, value)}.")
 
 
 def check_flag(name: str, value: Any) -> bool:
@@ -182,14 +207,38 @@ def reference(name: str, value: Any, steps: int, channels: int, symbol: str, lik
     """Return a reference as a tensor `(*batch, steps, channels)`, on the device of `like`; zero for None."""
     if value is None:
         return like.new_zeros(()).expand(steps, channels)
-    tensor = as_data(name, value, finite=False).to(like.device)
+    tensor = as_data(name, value, finite=False, integers=True).to(like.device)
+    may_be_batch = tensor.ndim == 2 and like.ndim > 2 and tensor.shape[0] == like.shape[-3] > 1
+    if may_be_batch and tensor.shape[0] == steps:
+        warn_of_two_readings(name, tensor, "samples", stacklevel=7)
     try:
         return tensor.expand(*tensor.shape[:-2], steps, channels)
     except RuntimeError as error:
+        hint = f" For one constant reference a sample give {name}[:, None]." if may_be_batch else ""
         raise ValueError(
             f"`{name}` must broadcast to (*batch, horizon, {symbol}) = (*, {steps}, {channels}), "
-            f"got {tuple(tensor.shape)}."
+            f"got {tuple(tensor.shape)}.{hint}"
         ) from error
+
+
+def warn_of_two_readings(name: str, reference: Tensor, many: str, *, stacklevel: int) -> None:
+    """Warn of a reference `(rows, n)` in a call of as many samples: is each row a step, or a sample?
+
+    Args:
+        name: of the reference.
+        reference: read as a trajectory, one row a step.
+        many: "samples" or "runs".
+        stacklevel: of the caller's caller, as :func:`warnings.warn` counts.
+    """
+    rows = len(reference)
+    if is_mapped(reference) or bool((reference == reference[:1]).all()):  # both readings are the same plan
+        return
+    warnings.warn(
+        f"`{name}` of shape {tuple(reference.shape)} is read as one trajectory of {rows} steps for all {rows} {many}. "
+        f"For one constant reference each give {name}[:, None]; {name}[None] is one trajectory for all, without this "
+        "warning.",
+        stacklevel=stacklevel,
+    )
 
 
 def with_one_batch(parts: list[Tensor]) -> list[Tensor]:

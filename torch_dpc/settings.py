@@ -11,7 +11,7 @@ from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, NamedTuple
 
-from .checks import as_index
+from .checks import as_index, cure
 from .data.hankel import HankelData
 from .data.hankel_batch import HankelBatch
 from .problem.terms import Sizes, Terms
@@ -161,7 +161,7 @@ def _set(name: str, value: Any) -> ConvexSet:
     if value is None:
         return Reals()
     if not isinstance(value, ConvexSet):
-        raise ValueError(f"`{name}` must be a ConvexSet or None, got {type(value).__name__}.")
+        raise ValueError(f"`{name}` must be a ConvexSet or None, got {type(value).__name__}{cure('set', value)}.")
     return value
 
 

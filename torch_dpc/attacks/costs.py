@@ -41,7 +41,7 @@ class TargetInput:
         if (u_target is None) == (trajectory is None):
             raise ValueError("give either `u_target` or `trajectory=`.")
         name, value = ("u_target", u_target) if trajectory is None else ("trajectory", trajectory)
-        self.target = as_data(name, value)
+        self.target = as_data(name, value, integers=True)
         self.moves = trajectory is not None
         self._name = name
         if self.target.ndim not in ((2,) if self.moves else (1, 2)) or not self.target.numel():
@@ -108,7 +108,7 @@ class TrackingError(Described):
         """Return the cost of a plan made from a window that is truly (u_ini, y_ini), under this reference."""
         t_ini, horizon = self.predictor.t_ini, self.predictor.horizon
         u_ini, y_ini = last_rows(u_ini, t_ini), last_rows(y_ini, t_ini)
-        reference = torch.zeros(()) if y_ref is None else to_horizon(as_data("y_ref", y_ref), horizon)
+        reference = torch.zeros(()) if y_ref is None else to_horizon(as_data("y_ref", y_ref, integers=True), horizon)
 
         def psi(solution: DPCSolution) -> Tensor:
             if solution.u.shape[-2] != horizon:

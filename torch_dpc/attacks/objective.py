@@ -159,6 +159,6 @@ def _reference(name: str, value: Any, horizon: int | None, batch: torch.Size) ->
     """Return a reference that the layer takes: None, shared by the batch, or one a sample."""
     if value is None:
         return None
-    tensor = as_data(name, value)
+    tensor = as_data(name, value, integers=True)
     tensor = tensor if horizon is None else to_horizon(tensor, horizon)
     return tensor if tensor.ndim <= 2 else _of_batch(name, tensor, batch)

@@ -15,8 +15,8 @@ def reference_trajectory(name: str, value: Any, steps: int, channels: int, horiz
 
     Args:
         name: what the caller calls it; errors say so.
-        value: `(channels,)`; a trajectory `(>= steps, channels)`, whose last row is held beyond its end; or one a run,
-            `(*batch, >= steps, channels)`, or `(*batch, 1, channels)` for constants.
+        value: a number for all channels, `(channels,)`, or a trajectory `(>= steps, channels)`, whose last row is held
+            beyond its end; or one a run, `(*batch, >= steps, channels)`, or `(*batch, 1, channels)` for constants.
         steps, channels, horizon: sizes.
 
     Returns:
@@ -25,8 +25,10 @@ def reference_trajectory(name: str, value: Any, steps: int, channels: int, horiz
     Raises:
         ValueError: shapes that do not fit, or values that are not finite.
     """
-    tensor = as_data(name, value).double()
-    if tensor.ndim == 1:
+    tensor = as_data(name, value, integers=True).double()
+    if tensor.ndim == 0:
+        tensor = tensor.expand(1, channels)
+    elif tensor.ndim == 1:
         tensor = tensor[None]
     elif tensor.ndim >= 2 and tensor.shape[-2] < steps and not (tensor.ndim > 2 and tensor.shape[-2] == 1):
         raise ValueError(f"`{name}` must have at least `steps` = {steps} rows, got {tensor.shape[-2]}.")

@@ -7,8 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import torch
+from torch import Tensor
 
-from ..checks import check_batch, check_callable, check_count, check_generator, check_type
+from ..checks import check_batch, check_callable, check_count, check_generator, check_type, warn_of_two_readings
 from ..systems.plant import Plant, Port, per_input
 from .checkpoints import advance_with_checkpoints
 from .controller import DPCController
@@ -49,8 +50,8 @@ def simulate(
     Args:
         plant: the system.
         controller: it is reset first.
-        y_ref: reference, `(n_y,)` or a trajectory `(*batch, >= steps, n_y)` whose last row is held beyond its end; for
-            a batch of constants `(*batch, 1, n_y)`.
+        y_ref: reference, a number, `(n_y,)` or a trajectory `(*batch, >= steps, n_y)` whose last row is held beyond its
+            end; for a batch of constants `(*batch, 1, n_y)`.
         steps: steps under control.
         u_ref: input reference, likewise; zero by default.
         attack: `(u_ini, y_ini, *, y_ref, u_ref, generator, step)` -> p, shape of y_ini, the windows `(*batch, t_ini,
@@ -105,7 +106,7 @@ def simulate(
         raise ValueError("`detector` must be left out with `checkpoint_every`: a detector may have a memory.")
     loop = Loop(port, controller, y_refs, u_refs, attack, generator, detector)
     loop.warm_up(_with_batch(plant, reset, batch), per_input("u_warmup", u_warmup, data.n_u))
-    _check_batches(loop, batch)
+    _share_references(loop, batch, y_ref, u_ref)
     if checkpoint_every is None:
         u, y, p, status, replanned, alarm = loop.advance(range(steps), progress)
     else:
@@ -140,12 +141,29 @@ def _with_batch(
     return {**arguments, "batch": check_batch("batch", batch)}
 
 
-def _check_batches(loop: Loop, batch: int | Sequence[int] | None) -> None:
-    """Raise ValueError where the plant, the references and what was asked for differ in their runs."""
+def _share_references(loop: Loop, batch: int | Sequence[int] | None, y_ref: Any, u_ref: Any) -> None:
+    """Give every run its references.
+
+    Raises:
+        ValueError: the plant, the references and what was asked for differ in their runs.
+    """
     runs = loop.batch
     if batch is not None and runs != check_batch("batch", batch):
         raise ValueError(f"`batch` is {batch!r}, and the plant runs {tuple(runs)}.")
-    for name, reference in (("y_ref", loop.y_refs), ("u_ref", loop.u_refs)):
-        own = reference.shape[:-2]
-        if own not in (torch.Size(()), runs):
-            raise ValueError(f"`{name}` has the runs {tuple(own)} in front, and the plant runs {tuple(runs)}.")
+    loop.y_refs = _of_runs("y_ref", y_ref, loop.y_refs, runs)
+    loop.u_refs = _of_runs("u_ref", u_ref, loop.u_refs, runs)
+
+
+def _of_runs(name: str, given: Any, reference: Tensor, runs: torch.Size) -> Tensor:
+    """Return a reference with the runs of the plant in front, `(*runs, rows, n)`.
+
+    Raises:
+        ValueError: it has other runs.
+    """
+    if isinstance(given, Tensor) and given.ndim == 2 and runs and len(given) == runs[-1] > 1:
+        warn_of_two_readings(name, given, "runs", stacklevel=5)
+    try:
+        return reference.expand(*runs, *reference.shape[-2:])
+    except RuntimeError as error:
+        own = tuple(reference.shape[:-2])
+        raise ValueError(f"`{name}` has the runs {own} in front, and the plant runs {tuple(runs)}.") from error

@@ -73,9 +73,10 @@ def weight_matrix(name: str, value: Any, channels: int, horizon: int) -> Tensor:
         matrix = matrix * torch.eye(channels, dtype=matrix.dtype, device=matrix.device)
     size = channels * horizon
     if matrix.ndim < 2 or matrix.shape[-2:] not in {(channels, channels), (size, size)}:
+        hint = f" For a diagonal weight give torch.diag({name})." if matrix.shape in {(channels,), (size,)} else ""
         raise ValueError(
             f"`{name}` must be a number or have shape ({channels}, {channels}) for one step or ({size}, {size}) for "
-            f"the whole horizon, got {tuple(matrix.shape)}."
+            f"the whole horizon, got {tuple(matrix.shape)}.{hint}"
         )
     transposed = matrix.mT
     with torch.no_grad():
