@@ -29,6 +29,7 @@ from tqdm import tqdm
 from scripts.experiments.quadrotor import Quadrotor
 from scripts.shared import bootstrap
 from scripts.shared.command import arguments, versions
+from scripts.shared.plots import note as write_note
 from scripts.shared.plots import plt, style
 from scripts.shared.rows import Array
 from scripts.shared.statistics import BAND, NOMINAL, POISON, RANDOM, band
@@ -129,6 +130,12 @@ def added(e: Errors) -> bootstrap.Interval | None:
     return bootstrap.added_ratio(e.poison, e.random, e.nominal)
 
 
+def reproduced(e: Errors, f: Errors) -> bool:
+    """Return whether the median factor of fresh seeds lies within the band over the first ones."""
+    _, low, high = band(e.by_seed)
+    return bool(low <= np.median(f.by_seed) <= high)
+
+
 def cell(value: bootstrap.Interval | None) -> str:
     """Return an interval, or why there is none."""
     return "random adds nothing" if value is None else f"{value:.1f}"
@@ -147,30 +154,36 @@ def table(rows: Sequence[dict[str, str]], seeds: Sequence[int], fresh: Sequence[
         cells += [cell(added(e)), str(e.crashed), str(e.unsolved)]
         if fresh:
             f = errors_of(rows, variation, fresh)
-            _, low, high = band(e.by_seed)
             cells += [f"{bootstrap.ratio(f.poison, f.random):.1f}", cell(added(f))]
-            cells += ["yes" if low <= np.median(f.by_seed) <= high else "no"]
+            cells += ["yes" if reproduced(e, f) else "no"]
         lines.append("| " + " | ".join(cells) + " |")
+    if fresh:
+        both = [(errors_of(rows, v, seeds), errors_of(rows, v, fresh)) for v in VARIATIONS]
+        lines += ["", f"Inside the band: {sum(reproduced(e, f) for e, f in both)} of {len(both)} settings."]
     return lines
 
 
-def plot(path: Path, rows: Sequence[dict[str, str]], seeds: Sequence[int]) -> None:
-    """Draw both factors of every variation with their intervals, grouped by what is changed."""
+def plot(path: Path, rows: Sequence[dict[str, str]], seeds: Sequence[int], fresh: Sequence[int]) -> None:
+    """Draw both factors of every variation with their intervals, grouped by what is changed; fresh seeds hollow."""
     style()
     groups = list(dict.fromkeys(variation.group for variation in VARIATIONS))
-    figure, axes = plt.subplots(figsize=(8.4, 8.6))
+    figure, axes = plt.subplots(figsize=(8.4, 9.6))
     places, names, place = [], [], 0.0
     for group in groups:
         axes.text(-0.02, place, group, transform=axes.get_yaxis_transform(), ha="right", va="center", weight="bold")
         place += 1
         for variation in (v for v in VARIATIONS if v.group == group):
-            e = errors_of(rows, variation, seeds)
-            found = {"ratio": bootstrap.ratio(e.poison, e.random), "added": added(e)}
-            for shift, (kind, value) in zip((-0.15, 0.15), found.items(), strict=True):
-                marker, colour, _ = LOOKS[kind]
-                if value is not None:
-                    axes.hlines(place + shift, value.low, value.high, color=colour, linewidth=1.6)
-                    axes.plot(value.value, place + shift, marker, color=colour, markersize=5)
+            for some, shift in ((seeds, -0.1), (fresh, 0.1)) if fresh else ((seeds, 0.0),):
+                e = errors_of(rows, variation, some)
+                found = {"ratio": bootstrap.ratio(e.poison, e.random), "added": added(e)}
+                for lower, (kind, value) in zip((-0.2, 0.2), found.items(), strict=True):
+                    marker, colour, _ = LOOKS[kind]
+                    if value is not None:
+                        face = colour if some is seeds else "white"
+                        axes.hlines(place + lower + shift, value.low, value.high, color=colour, linewidth=1.2)
+                        axes.plot(
+                            value.value, place + lower + shift, marker, color=colour, markersize=4, markerfacecolor=face
+                        )
             places.append(place)
             names.append(variation.name)
             place += 1
@@ -184,8 +197,9 @@ def plot(path: Path, rows: Sequence[dict[str, str]], seeds: Sequence[int]) -> No
     axes.minorticks_off()
     for marker, colour, label in LOOKS.values():
         axes.plot([], [], marker, color=colour, linestyle="-", label=label)
-    axes.legend(loc="lower right", frameon=True)
-    figure.suptitle(f"ratio of means over {len(seeds)} seeds, bars: 95 % paired bootstrap intervals", fontsize=10)
+    figure.legend(*axes.get_legend_handles_labels(), loc="outside upper center", ncols=2)
+    text = f"ratio of means over {len(seeds)} seeds;\nbars: 95 % paired bootstrap interval"
+    write_note(axes, text + (f";\nhollow: {len(fresh)} fresh seeds" if fresh else ""), "lower right")
     figure.savefig(path)
     plt.close(figure)
 
@@ -220,7 +234,7 @@ def main(argv: list[str] | None = None) -> None:
         *table(flown.rows(), seeds, fresh),
     ]
     (out / "study_recipe.md").write_text("\n".join(lines) + "\n")
-    plot(out / "study_recipe.png", flown.rows(), seeds)
+    plot(out / "study_recipe.png", flown.rows(), seeds, fresh)
     print(f"Recipe: {out / 'study_recipe.md'}, {time.perf_counter() - began:.0f} s")
 
 

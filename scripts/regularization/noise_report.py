@@ -9,9 +9,9 @@ from typing import Any
 import numpy as np
 
 from scripts.shared import bootstrap
-from scripts.shared.plots import COLOURS, NAMES, draw_band, plt, style
+from scripts.shared.plots import COLOURS, NAMES, draw_band, note, plt, style
 from scripts.shared.rows import Array
-from scripts.shared.statistics import NOMINAL, POISON, RANDOM
+from scripts.shared.statistics import BAND, NOMINAL, POISON, RANDOM
 
 Lines = Sequence[Mapping[str, str]]
 
@@ -102,13 +102,10 @@ def draw(path: Path, titles: Mapping[str, str], gains: Lines, runs: Lines, seeds
         for axes in row[:3]:
             axes.set_ylim(LIMITS[plant])
         row[0].set_ylabel(f"{plant}\nsensitivity [{UNITS[plant]}]")
-    for axes, title in zip(panels[0], ("noise and ridge", "lambda_s", "lambda_g", "closed loop"), strict=True):
+    for axes, title in zip(panels[0], ("noise and ridge", r"$\lambda_s$", r"$\lambda_g$", "closed loop"), strict=True):
         axes.set_title(title)
-    figure.suptitle(
-        f"median over {len(seeds)} recordings, bands from the 10th to the 90th percentile; "
-        "sensitivity: max |du| / |p| of the plan without its bounds",
-        fontsize=10,
-    )
+    note(panels[0, 0], "max |du| / |p| of the plan without its bounds")
+    note(panels[0, 1], f"median of {len(seeds)} recordings,\nband: {BAND[0]}th to {BAND[1]}th percentile")
     figure.savefig(path)
     plt.close(figure)
 
@@ -133,7 +130,7 @@ def _draw_lambda(axes: Any, gains: Lines, plant: str, name: str, seeds: Sequence
     for level, colour in NOISE_COLOURS.items():
         _line(axes, gains_of(gains, plant, name, seeds, level), color=colour, label=f"noise {level:g}")
     axes.axvline({"lambda_s": 1e6, "lambda_g": 1e2}[name], color="black", linewidth=0.8, linestyle=":")
-    axes.set(xscale="log", yscale="log", xlabel=f"{name} (dotted: the paper's)")
+    axes.set(xscale="log", yscale="log", xlabel=rf"$\{name}$ (dotted: the paper's)")
     axes.legend(fontsize=8, loc="lower right")
 
 
@@ -146,7 +143,7 @@ def _draw_closed(axes: Any, runs: Lines, plant: str, seeds: Sequence[int]) -> No
             label = NAMES[attack] if kind == "noise" else None
             axes.plot(sizes, median, color=COLOURS[attack], linestyle=line, label=label)
             if kind == "noise":
-                low, high = np.percentile(values, (10, 90), axis=0)
+                low, high = np.percentile(values, BAND, axis=0)
                 axes.fill_between(sizes, low, high, color=COLOURS[attack], alpha=0.2, linewidth=0)
     axes.set(
         xscale="log", yscale="log", xlabel="noise (solid), ridge (dashed)", ylabel="mean error [m]", ylim=(0.01, 1.0)

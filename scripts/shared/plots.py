@@ -113,11 +113,12 @@ def crash_steps(rows: Rows, attack: str, rho: float) -> list[tuple[int, int]]:
 def paths_from_above(path: Path, rows: Rows, rho: float, reference: Array) -> None:
     """Draw the paths flown in the xy-plane: no attack, random noise and Algorithm 1, one line a seed."""
     style()
-    figure, panels = plt.subplots(1, 3, figsize=(8.4, 3.9), sharex=True, sharey=True)
+    figure, panels = plt.subplots(1, 3, figsize=(8.4, 3.5), sharex=True, sharey=True)
+    seeds = len(np.unique(rows["seed"]))
     for axes, (attack, level) in zip(panels, ((NOMINAL, 0.0), (RANDOM, rho), (POISON, rho)), strict=True):
         x, y = grid(rows, "x", attack, level), grid(rows, "y", attack, level)
         axes.plot(x.T, y.T, color="#0072b2", linewidth=0.8, alpha=0.6)
-        axes.plot([], [], color="#0072b2", label="flown, one line a seed")
+        axes.plot([], [], color="#0072b2", label=f"flown, one line for each of {seeds} seeds")
         axes.plot(reference[:, 0], reference[:, 1], "k--", linewidth=1.2, label="reference")
         for i, step in crash_steps(rows, attack, level):
             axes.plot(x[i, step], y[i, step], "x", color="#d55e00", markersize=8, markeredgewidth=2)
