@@ -1,6 +1,7 @@
 """Differentiable data-driven predictive control for PyTorch, and attacks on it."""
 
 import importlib
+import logging
 from types import ModuleType
 
 from . import attacks, detection, plot, systems, tuning
@@ -33,6 +34,8 @@ from .solve.info import SolveInfo
 from .systems.plant import Plant, collect
 
 __version__ = "0.1.0"
+
+logging.getLogger(__name__).addHandler(logging.NullHandler())  # the application decides what is shown
 
 __all__ = [
     "Ball",

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from dataclasses import dataclass, replace
 from typing import Any
@@ -17,6 +18,8 @@ from .nearest import NearestWindows
 from .past import Past
 from .plan_times import PlanTimes
 from .soften import plan_softened, require_boxes
+
+LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -206,9 +209,13 @@ class DPCController:
         if not bool(solved.all()):
             if self.on_failure == "soften":
                 inputs, widths = self._softened((u_ini, y_ini, y_ref, u_ref), plan.u, ~solved)
+                widest = float(torch.as_tensor(widths).max())
+                LOGGER.warning("no plan within the output bounds: they are softened by up to %.3g", widest)
             else:
+                LOGGER.warning("no plan: the previous one is held")
                 inputs = torch.where(solved[..., None, None], inputs, self._rest(plan.u))
         if self.on_alarm == "hold" and alarm is not None and bool(alarm.any()):
+            LOGGER.warning("the detector mistrusts the window: the previous plan is held")
             inputs = torch.where(alarm[..., None, None], self._rest(plan.u), inputs)
         self.state = ControllerState(
             inputs, 0, self.replan_every, Status(int(status)) if status.ndim == 0 else status, widths

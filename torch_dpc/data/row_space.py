@@ -8,11 +8,14 @@ squares of the other entries of a.
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
+
+LOGGER = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, eq=False)
@@ -76,7 +79,7 @@ class RowSpace:
         basis = columns @ torch.cat([in_W, in_rest], dim=1)
         kept = torch.cat([kept_W, kept_rest]) / largest
         dropped = torch.cat([dropped_W, dropped_rest]) / largest
-        return RowSpace(
+        space = RowSpace(
             basis=basis,
             units=units,
             rank=basis.shape[1],
@@ -85,6 +88,13 @@ class RowSpace:
             last_kept=float(kept.min()) if kept.numel() else 0.0,
             first_dropped=float(dropped.max()) if dropped.numel() else 0.0,
         )
+        LOGGER.log(
+            logging.INFO if space.clear else logging.WARNING,
+            "rank %d of %d rows (%d of the past and the future inputs), singular values %.1e kept, %.1e dropped%s",
+            *(space.rank, space.n_rows, space.rank_W, space.last_kept, space.first_dropped),
+            "" if space.clear else ": no clear gap",
+        )
+        return space
 
 
 def row_units(matrices: Sequence[Tensor], n_u: int, n_y: int, n_windows: int) -> Tensor:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import NamedTuple
@@ -12,6 +13,8 @@ from torch import Tensor
 from ..checks import as_data, is_finite
 from ..errors import InfeasibleError, SolveError, Status
 from ..problem.terms import Sizes
+
+LOGGER = logging.getLogger("torch_dpc.solve")
 
 
 @dataclass(frozen=True)
@@ -154,7 +157,7 @@ def check_finite(theta: Tensor, sizes: Sizes) -> None:
 
 
 def report_failures(info: Tensor, on_failure: str) -> None:
-    """Raise if a sample failed and `on_failure` is "raise".
+    """Raise if a sample failed and `on_failure` is "raise"; log it if it is "nan".
 
     Args:
         info: as in :class:`Solved`, `(*batch, 5)`.
@@ -164,7 +167,11 @@ def report_failures(info: Tensor, on_failure: str) -> None:
         InfeasibleError: every failed sample is proven infeasible.
         SolveError: another failure.
     """
-    if on_failure == "nan" or not bool((info[..., 0] != Status.SOLVED).any()):
+    if not bool((info[..., 0] != Status.SOLVED).any()):
+        return
+    if on_failure == "nan":
+        without = [int((info[..., 0] == status).sum()) for status in (Status.INFEASIBLE, Status.FAILED)]
+        LOGGER.info("no plan for %d samples: %d proven infeasible, %d failed", sum(without), *without)
         return
     batch, info = info.shape[:-1], info.reshape(-1, info.shape[-1])
     failed = (info[:, 0] != Status.SOLVED).nonzero()[:, 0]

@@ -32,7 +32,7 @@ from .consistency import excess_cost, inconsistency
 from .engines import Engines, Sets
 from .kernels import PlannedArrays
 from .optimality import BATCHED, Optimality
-from .outcome import ACCEPTANCE, JudgedSets, Planned, Solved, check_finite, joined, report_failures
+from .outcome import ACCEPTANCE, LOGGER, JudgedSets, Planned, Solved, check_finite, joined, report_failures
 from .projected_system import newton_step
 from .second_look import SecondLook
 from .selection import uncharged
@@ -142,6 +142,7 @@ class Solver:
         solved = Solved(v, lam, active, info, None if sets.is_box else weak)
         rest = (~convinces).nonzero()[:, 0]
         part = sets.of_samples(rest) if isinstance(sets, Bounds) else sets
+        LOGGER.debug("the compiled kernel left %d of %d samples to the engines", len(rest), len(theta))
         solved.put(rest, self._solve_generally(theta[rest], part))
         return solved
 
@@ -183,6 +184,7 @@ class Solver:
             rest = solved.failed.nonzero()[:, 0]
             if len(rest) == 0:
                 return solved
+            LOGGER.info("%s left %d of %d samples, %s solves them", first, len(rest), len(theta), name)
             assert isinstance(sets, Bounds)
             retried, _ = self._of_samples(rest)._attempt(name, theta[rest], v0[rest], sets.of_samples(rest))
             solved.put(rest, retried)
