@@ -2,6 +2,7 @@
 
 import subprocess
 import sys
+import textwrap
 import types
 from dataclasses import replace
 
@@ -268,15 +269,22 @@ def test_the_users_settings_stay(runs):
     assert dict(matplotlib.rcParams) == before
 
 
-def test_a_notebook_shows_a_figure_once(runs, monkeypatch):
-    figure = plot.log(runs[0])
-    with pytest.raises(NotImplementedError):  # not an inline backend: IPython's usual way
-        figure._ipython_display_()
-    monkeypatch.setattr(matplotlib, "get_backend", lambda: "module://matplotlib_inline.backend_inline")
-    assert figure._ipython_display_() is None  # inline shows all open figures after the cell
-    plt.close(figure)
-    with pytest.raises(NotImplementedError):
-        figure._ipython_display_()
+@pytest.mark.slow
+def test_a_notebook_shows_every_figure_once():
+    """The kernel of a notebook runs the cells: a figure is shown as the value of its cell, or else after it."""
+    nbclient, v4 = pytest.importorskip("nbclient"), pytest.importorskip("nbformat.v4")
+    pytest.importorskip("ipykernel")
+    setup = """
+        import torch, torch_dpc as dpc, matplotlib.pyplot as plt
+        u = torch.rand(60, 1, generator=torch.Generator().manual_seed(0))
+        data = dpc.HankelData.from_trajectories(u, u.cumsum(0) - u, t_ini=2, horizon=4)
+        """
+    alone = ["data.plot();", "data.plot()", "figure = data.plot()", "figure", "plt.plot([1]);"]
+    cells = [*alone, "data.plot(); data.plot();"]
+    notebook = v4.new_notebook(cells=[v4.new_code_cell(text) for text in (textwrap.dedent(setup), *cells)])
+    nbclient.NotebookClient(notebook, timeout=120).execute()
+    shown = [sum("image/png" in output.get("data", {}) for output in cell.outputs) for cell in notebook.cells]
+    assert shown == [0, 1, 1, 1, 1, 1, 2]
 
 
 def test_importing_the_package_imports_no_matplotlib():

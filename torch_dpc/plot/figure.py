@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import matplotlib
@@ -19,21 +20,35 @@ BLUE, VERMILION, GREEN, ORANGE, PURPLE = "#0072b2", "#d55e00", "#009e73", "#e69f
 CYCLE = (BLUE, VERMILION, GREEN, PURPLE, ORANGE, "#56b4e9", "black")
 GREY = "0.45"
 
-#: The look of the figures, around every function that draws one; the user's own settings stay as they are.
-styled = matplotlib.rc_context(
-    {
-        "figure.constrained_layout.use": True,
-        "axes.spines.top": False,
-        "axes.spines.right": False,
-        "axes.grid": True,
-        "grid.alpha": 0.25,
-        "grid.linewidth": 0.6,
-        "axes.axisbelow": True,
-        "axes.titlesize": "medium",
-        "legend.frameon": False,
-        "lines.linewidth": 1.5,
-    }
-)
+
+@contextmanager
+def _in_style() -> Iterator[None]:
+    """Draw with the look of the figures. The interactive mode, which a first figure may set, is not undone."""
+    look = matplotlib.rc_context(
+        {
+            "figure.constrained_layout.use": True,
+            "axes.spines.top": False,
+            "axes.spines.right": False,
+            "axes.grid": True,
+            "grid.alpha": 0.25,
+            "grid.linewidth": 0.6,
+            "axes.axisbelow": True,
+            "axes.titlesize": "medium",
+            "legend.frameon": False,
+            "lines.linewidth": 1.5,
+        }
+    )
+    interactive = matplotlib.is_interactive()
+    try:
+        with look:
+            yield
+            interactive = matplotlib.is_interactive()
+    finally:
+        matplotlib.interactive(interactive)
+
+
+#: Around every function that draws; the user's own settings stay as they are.
+styled = _in_style()
 
 #: Runs of a batch that are drawn line by line; more are drawn as their median and the band that holds most of them.
 FEW_RUNS = 8
@@ -43,12 +58,16 @@ BAND_LABEL = "median and 10 to 90 %"
 
 
 class NotebookFigure(Figure):
-    """A figure that a notebook shows once, also where it is the value of a cell."""
+    """A figure that a notebook shows once: as the value of a cell, or else after it.
+
+    The inline backend shows and closes every open figure after a cell. One that was the value of the cell would come
+    twice, so it is closed as soon as it is shown.
+    """
 
     def _ipython_display_(self) -> None:
-        shown_after_the_cell = "inline" in matplotlib.get_backend() and plt.fignum_exists(getattr(self, "number", -1))
-        if not shown_after_the_cell:
-            raise NotImplementedError  # IPython then shows it in its usual way
+        if "inline" in matplotlib.get_backend():
+            plt.close(self)
+        raise NotImplementedError  # IPython then shows it in its usual way
 
 
 def new_figure(size: tuple[float, float]) -> Figure:
