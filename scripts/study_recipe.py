@@ -160,6 +160,17 @@ def table(rows: Sequence[dict[str, str]], seeds: Sequence[int], fresh: Sequence[
     if fresh:
         both = [(errors_of(rows, v, seeds), errors_of(rows, v, fresh)) for v in VARIATIONS]
         lines += ["", f"Inside the band: {sum(reproduced(e, f) for e, f in both)} of {len(both)} settings."]
+        lines += ["", *pooled(rows, [*seeds, *fresh])]
+    return lines
+
+
+def pooled(rows: Sequence[dict[str, str]], seeds: Sequence[int]) -> list[str]:
+    """Return the lines of the table of both factors over all seeds together."""
+    lines = [f"| all {len(seeds)} seeds | error / error | seeds above 10 | added / added |", "|---|---|---|---|"]
+    for variation in VARIATIONS:
+        e = errors_of(rows, variation, seeds)
+        cells = [variation.key, f"{bootstrap.ratio(e.poison, e.random):.1f}", str(int((e.by_seed > CLAIM).sum()))]
+        lines.append("| " + " | ".join([*cells, cell(added(e))]) + " |")
     return lines
 
 

@@ -40,8 +40,10 @@ from scripts.regularization.search import (
     GUARDED,
     METHODS,
     ONLY_LAMBDAS,
+    REFINED,
     RIDGE_SIZE,
     RIDGED,
+    SAMPLED,
     STEPS,
     Found,
     searches,
@@ -58,9 +60,11 @@ QUICK_STEPS = 5
 
 
 def search_jobs(case: str, methods: Sequence[str]) -> list[tuple[str, float, tuple[str, ...]]]:
-    """Return the searches of one case; that of Optuna follows the one whose time it is given."""
-    timed = tuple(m for m in ("attack", "tpe") if m in methods)
-    jobs: list[tuple[str, float, tuple[str, ...]]] = [(case, 1.0, timed)] if timed else []
+    """Return the searches of one case; those that need another's time or point follow it in one job."""
+    in_turn = (("attack", "tpe"), (SAMPLED, REFINED))
+    jobs: list[tuple[str, float, tuple[str, ...]]] = [
+        (case, 1.0, some) for group in in_turn if (some := tuple(m for m in group if m in methods))
+    ]
     jobs += [(case, w, ("attack",)) for w in ATTACKED_WEIGHTS if w != 1.0 and "attack" in methods]
     return [*jobs, *((case, 1.0, (m,)) for m in (GUARDED, RIDGED, "danskin", ONLY_LAMBDAS) if m in methods)]
 

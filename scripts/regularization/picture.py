@@ -20,7 +20,7 @@ from scripts.regularization.report import (
     judged,
     summary,
 )
-from scripts.regularization.search import GUARDED, METHODS, ONLY_LAMBDAS, RIDGED
+from scripts.regularization.search import GUARDED, METHODS, ONLY_LAMBDAS, REFINED, RIDGED, SAMPLED
 from scripts.regularization.trials import TINY
 from scripts.shared.plots import note, plt, style
 
@@ -28,6 +28,8 @@ from scripts.shared.plots import note, plt, style
 LOOKS = {
     GUARDED: ("#d55e00", "o", METHODS[GUARDED]),
     RIDGED: ("#35178c", "s", METHODS[RIDGED]),
+    SAMPLED: ("#e69f00", "P", METHODS[SAMPLED]),
+    REFINED: ("#cc79a7", "X", METHODS[REFINED]),
     ONLY_LAMBDAS: ("#009e73", "^", METHODS[ONLY_LAMBDAS]),
     "": ("#56b4e9", "v", "searches of the plain sum"),
 }

@@ -18,14 +18,17 @@ STEPS, RATE = 60, 0.4  # of Adam
 LIMIT = math.log(1e3)  # how far each logarithm may move
 ATTACKED_WEIGHTS = (0.3, 1.0, 3.0)
 RIDGE_SIZE = 1e-2  # of the spread of each output, what study_noise.py recommends
-ONLY_LAMBDAS, GUARDED, RIDGED = "lambdas", "guarded", "ridged"
+SAMPLES = 150  # evaluations of a guarded search by samples
+ONLY_LAMBDAS, GUARDED, RIDGED, SAMPLED, REFINED = "lambdas", "guarded", "ridged", "sampled", "refined"
 METHODS = {
     GUARDED: "gradient, guarded",
+    SAMPLED: f"Optuna, TPE, guarded, {SAMPLES} evaluations",
+    REFINED: "the same, then the gradient",
     RIDGED: "gradient, guarded, on data with the ridge",
     "attack": "gradient through the attack",
     "danskin": "gradient with the attack held (Danskin)",
     ONLY_LAMBDAS: "gradient, lambda_g and lambda_s only",
-    "tpe": "Optuna, TPE, at the same processor time",
+    "tpe": "Optuna, TPE, at the gradient's processor time",
 }
 
 
@@ -49,7 +52,7 @@ class Found(NamedTuple):
 
 
 def searches(case_name: str, attacked_weight: float, methods: Sequence[str], steps: int = STEPS) -> list[Found]:
-    """Run several searches one after the other; Optuna's has the processor time that the first one took."""
+    """Run several searches in turn: "tpe" has the time of the first, `REFINED` starts at the point of the last."""
     torch.set_num_threads(1)
     case = CASES[case_name]
     found: list[Found] = []
@@ -58,12 +61,16 @@ def searches(case_name: str, attacked_weight: float, methods: Sequence[str], ste
             weights = case.paper() if method == ONLY_LAMBDAS else start(case)
             through = "danskin" if method == "danskin" else "attack"
             guard: dict[str, Any] = {
-                "guarded": method in (GUARDED, RIDGED),
+                "guarded": method in (GUARDED, RIDGED, SAMPLED, REFINED),
                 "ridge": RIDGE_SIZE if method == RIDGED else 0.0,
             }
             goals = objectives(case, plant, weights, **guard, attacked_weight=attacked_weight, through=through)
             if method == "tpe":
-                scales, history = by_optuna(goals, found[0].seconds)
+                scales, history = by_optuna(goals, seconds=found[0].seconds)
+            elif method == SAMPLED:
+                scales, history = by_optuna(goals, evaluations=SAMPLES if steps == STEPS else steps)
+            elif method == REFINED:
+                scales, history = by_gradient(goals, scales, steps)
             else:
                 scales = tuning.WeightScales(goals[0].layer)
                 for free in (scales.Q, scales.R):
@@ -84,9 +91,9 @@ def by_gradient(
 
 
 def by_optuna(
-    objectives: list[tuning.RobustObjective], seconds: float
+    objectives: list[tuning.RobustObjective], seconds: float = math.inf, evaluations: int | None = None
 ) -> tuple[tuning.WeightScales, list[dict[str, float]]]:
-    """Tune by Optuna's TPE for so much processor time, its own included, from the same start.
+    """Tune by Optuna's TPE for so much processor time, its own included, or so many evaluations, from the same start.
 
     The first logarithm of R is left at 0, which takes the common factor out of the search.
     """
@@ -118,7 +125,7 @@ def by_optuna(
 
     study = optuna.create_study(sampler=optuna.samplers.TPESampler(seed=0))
     study.enqueue_trial({name: 0.0 for i, name in enumerate(names) if i != pinned})
-    study.optimize(value, callbacks=[stop])
+    study.optimize(value, n_trials=evaluations, callbacks=[stop])
     set_to(study.best_params)
     return scales, course.rows
 
