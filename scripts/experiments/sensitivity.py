@@ -9,17 +9,14 @@ import torch
 from torch import Tensor
 
 import torch_dpc as dpc
+from torch_dpc import tuning
 
 NOISE_SEED = 7000  # the noise of a recording of seed s is drawn from NOISE_SEED + s
 
 
 def plan_gain(layer: dpc.DPCLayer) -> float:
     """Return max |u(y_ini + p) - u(y_ini)| / |p| of the plan without its bounds, the spectral norm of du / dy_ini."""
-    data = layer.data
-    V = layer.reduction.V  # v = V theta, theta = (u_ini, y_ini, u_ref, y_ref), v = (u, y)
-    first = data.t_ini * data.n_u
-    block = V[: data.horizon * data.n_u, first : first + data.t_ini * data.n_y]
-    return float(torch.linalg.matrix_norm(block, 2))
+    return float(tuning.plan_gain(layer))
 
 
 def with_noise(y: Tensor, size: float, seed: int) -> Tensor:

@@ -106,6 +106,7 @@ WINDOWS = tuning.Windows(*windows(4, 3), torch.zeros(4))
 
 def objective(**options):
     arguments = {"layer": LAYER, "windows": WINDOWS, "budget": attacks.BallBudget(0.1), **options}
+    arguments.setdefault("predictor", tuning.Predictor(LAYER.data))
     return tuning.RobustObjective(
         arguments.pop("layer"), arguments.pop("windows"), arguments.pop("budget"), **arguments
     )
@@ -118,13 +119,14 @@ def _tuning() -> list[Call]:
         *each("windows", "RobustObjective windows", (None, 3, "a", torch.ones(2)), lambda x: objective(windows=x)),
         *each("budget", "RobustObjective budget", (None, 3, 0.1, "a"), lambda x: objective(budget=x)),
         *each("psi", "RobustObjective psi", (3, "a"), lambda x: objective(psi=x)),
-        *each("predictor", "RobustObjective predictor", (3, "a"), lambda x: objective(predictor=x)),
+        *each("predictor", "RobustObjective predictor", (3, "a", None), lambda x: objective(predictor=x)),
         *each("cost", "RobustObjective cost", (3, "a"), lambda x: objective(cost=x)),
         *each("plans", "RobustObjective plans", NO_COUNT, lambda n: objective(plans=n)),
         *each(
             "replan_every", "RobustObjective replan_every", (0, -1, 1.5, "3", 99), lambda n: objective(replan_every=n)
         ),
         *each("attacked_weight", "RobustObjective attacked_weight", NEGATIVE, lambda w: objective(attacked_weight=w)),
+        *each("gain_weight", "RobustObjective gain_weight", NEGATIVE, lambda w: objective(gain_weight=w)),
         *each("through", "RobustObjective through", ("walls", None, 3), lambda x: objective(through=x)),
         *each("iterations", "RobustObjective iterations", NO_COUNT, lambda n: objective(iterations=n)),
         *each("objectives", "tune objectives", (None, [], 3, "a", [3]), lambda x: tuning.tune(x, steps=1)),
@@ -133,7 +135,7 @@ def _tuning() -> list[Call]:
         *each("limit", "tune limit", (-1.0, 0.0, NAN, "a", None), lambda x: tune(limit=x)),
         *each("seconds", "tune seconds", (-1.0, NAN, "a", None), lambda x: tune(seconds=x)),
         *each("scales", "tune scales", (3, "a"), lambda x: tune(scales=x)),
-        *each("progress", "tune progress", (3, "a"), lambda x: tune(progress=x)),
+        *each("progress", "tune progress", (3, "a", None), lambda x: tune(progress=x)),
         *each("layer", "WeightScales", (None, 3, "a"), tuning.WeightScales),
         *each("channels", "MeanError", (None, 3, "a", [], [1.5], [-1]), tuning.MeanError),
         *each(

@@ -1,5 +1,6 @@
 """Weights that hold under attack: both derivatives of the objective, the gauge, the attacker, and the search."""
 
+import io
 import math
 
 import pytest
@@ -20,6 +21,7 @@ def objective(n=4, *, layer=None, u_ref=None, **options):
     layer = small_layer() if layer is None else layer
     u_ini, y_ini = windows(n, t_ini=3, seed=3, scale=0.1)
     y_ref = torch.tensor([0.1, -0.1, 0.0, 0.0])
+    options.setdefault("predictor", tuning.Predictor(layer.data))
     return tuning.RobustObjective(layer, tuning.Windows(u_ini, y_ini, y_ref, u_ref), BUDGET, **options)
 
 
@@ -141,7 +143,8 @@ def test_a_window_without_a_plan_holds_its_last_input():
     u_ini, y_ini = delayed_windows(3, impossible=[1])
     status = layer(u_ini, y_ini, on_failure="nan").info.status
     assert (status == torch.tensor([dpc.Status.SOLVED, dpc.Status.INFEASIBLE, dpc.Status.SOLVED])).all()
-    J = tuning.RobustObjective(layer, tuning.Windows(u_ini, y_ini, torch.zeros(2)), BUDGET, plans=2, replan_every=3)
+    run = {"predictor": tuning.Predictor(layer.data), "plans": 2, "replan_every": 3}
+    J = tuning.RobustObjective(layer, tuning.Windows(u_ini, y_ini, torch.zeros(2)), BUDGET, **run)
     scales = tuning.WeightScales(layer)
     held = J.predictor(u_ini[1:2], y_ini[1:2], u_ini[1:2, -1:].expand(-1, 6, -1))
     seen = []
@@ -271,3 +274,56 @@ def test_bad_windows_are_named():
     batched = dpc.DPCLayer(small_data(), Q=10.0, R=1.0, lambda_g=torch.tensor([1.0, 2.0]), lambda_s=1e3)
     with pytest.raises(ValueError, match="batch dimension"):
         objective(layer=batched, cost=tuning.MeanError([0]))(tuning.WeightScales(batched))
+
+
+def test_data_that_would_judge_their_own_plans_are_refused():
+    u_ini, y_ini = windows(2, t_ini=3, seed=3)
+    with pytest.raises(ValueError, match=r"`predictor` must say what inputs truly do.*tuning.Predictor\(other_data\)"):
+        tuning.RobustObjective(small_layer(), tuning.Windows(u_ini, y_ini, torch.zeros(4)), BUDGET)
+
+
+# --- the gain ---------------------------------------------------------------------------------------------------------
+
+
+def test_the_gain_is_that_of_the_worst_perturbation_and_below_the_certificate():
+    layer = small_layer()
+    free = dpc.DPCLayer(layer.data, Q=10.0, R=1.0, lambda_g=1.0, lambda_s=1e3)
+    y_ini = torch.zeros(3, 4).double()
+    jacobian = torch.autograd.functional.jacobian(lambda y: free(torch.zeros(3, 2).double(), y).u.flatten(), y_ini)
+    expected = float(torch.linalg.svdvals(jacobian.reshape(12, 12))[0])
+    assert float(tuning.plan_gain(layer)) == pytest.approx(expected, rel=1e-8)
+    pytest.importorskip("clarabel", reason="extra `exact`")
+    assert float(tuning.plan_gain(layer)) <= float(dpc.attacks.sensitivity_bound(layer)) * (1 + 1e-9)
+
+
+def test_the_gain_in_the_objective_has_its_derivative_and_falls():
+    at = 0.3 * randn(8, seed=1)
+    J = objective(psi=TARGET, gain_weight=0.1)
+    assert relative(gradient(J, at), differences(J, at)) < DIFFERENCES
+    value = J(scales_at(at))
+    expected = value["nominal"] + value["attacked"] + 0.1 * value["gain"]
+    torch.testing.assert_close(value["total"], expected)
+    result = tuning.tune(objective(psi=TARGET, gain_weight=10.0), steps=10, progress=False)
+    assert float(tuning.plan_gain(result.layer)) < float(tuning.plan_gain(small_layer()))
+
+
+# --- progress ---------------------------------------------------------------------------------------------------------
+
+
+def test_progress_is_shown_unless_it_is_switched_off(caplog, capsys):
+    caplog.set_level("INFO", logger="torch_dpc.tuning")
+    tuning.tune(objective(psi=TARGET), steps=3)  # no terminal here: the log
+    assert [record.message.split(":")[0] for record in caplog.records] == [f"step {k} of 3" for k in (1, 2, 3)]
+    assert "objective" in caplog.records[0].message and not capsys.readouterr().out
+    caplog.clear()
+    tuning.tune(objective(psi=TARGET), steps=2, progress=False)
+    assert not caplog.records
+
+
+def test_a_terminal_shows_a_bar(monkeypatch):
+    pytest.importorskip("tqdm", reason="extra `scripts`")
+    screen = io.StringIO()
+    screen.isatty = lambda: True
+    monkeypatch.setattr("sys.stderr", screen)
+    tuning.tune(objective(psi=TARGET), steps=3)
+    assert "3/3" in screen.getvalue() and "best=" in screen.getvalue()

@@ -81,3 +81,58 @@ def test_weights_under_adam_stay_in_their_domain():
         tuning.Positive().right_inverse(torch.tensor(0.0))
     with pytest.raises(ValueError, match="positive semidefinite"):
         tuning.Semidefinite().right_inverse(-torch.eye(2))
+
+
+# --- every attack, every recording ------------------------------------------------------------------------------------
+
+COST, BUDGET = attacks.TargetInput(torch.zeros(2)), attacks.RelativeBall(0.1)
+RUN = {"resets": {"state": 0.3 * Y_REF + 0.2 * randn(3, 4, seed=2)}, "y_ref": 0.3 * Y_REF, "u_ref": 0.3 * HOLDING}
+RUN |= {"steps": 20, "replan_every": 5}
+
+
+def recorded(seed, **weights):
+    data = masses_data(0.01, steps=150, t_ini=3, horizon=8, seed=seed)
+    return dpc.DPCLayer(data, **{"Q": 10.0, "R": 1.0, "lambda_g": 1.0, "lambda_s": 1e4, **weights})
+
+
+def test_the_verdict_has_every_attack_on_every_recording():
+    before, after = ([recorded(seed, Q=q) for seed in (0, 1)] for q in (10.0, 1.0))
+    suite = tuning.attack_suite(COST, BUDGET, steps=2, queries=3)
+    plant = dpc.systems.OscillatingMasses()
+    verdict = tuning.judge(plant, before, after, attacks=suite, **RUN)
+    assert set(verdict.before) == {"from every start", *suite} and len(suite) == 7 and verdict.runs == 6
+    one = tuning.scenarios(plant, before[1], attacks=suite, **RUN)
+    two = tuning.scenarios(plant, before[0], attacks=suite, **RUN)
+    for name, errors in one.items():
+        assert verdict.before[name] == float(torch.cat([two[name], errors]).mean())
+    assert verdict.certified is None and "certified" not in str(verdict)
+
+
+def test_the_strongest_of_all_is_at_least_as_strong_as_each():
+    layer = recorded(0, u_set=dpc.Box(-1.0, 1.0))
+    u_ini, y_ini = layer.data.Up[:, :4].mT.reshape(4, 3, 2), layer.data.Yp[:, :4].mT.reshape(4, 3, 4)
+    psi = {}
+    for name, make in tuning.attack_suite(COST, BUDGET, steps=3, queries=5).items():
+        p = make(layer)(u_ini, y_ini, y_ref=0.3 * Y_REF, generator=generator())
+        psi[name] = COST(layer(u_ini, y_ini + p, y_ref=0.3 * Y_REF))
+    single = torch.stack([value for name, value in psi.items() if name not in ("strongest of all", "tracking")])
+    assert (psi["strongest of all"] <= single[1:].amin(0) * (1 + 1e-9)).all()
+
+
+def test_the_certificate_stands_beside_the_errors():
+    pytest.importorskip("clarabel", reason="extra `exact`")
+    layers = [recorded(0, Q=q, u_set=dpc.Box(-1.0, 1.0)) for q in (10.0, 1.0)]
+    verdict = tuning.judge(dpc.systems.OscillatingMasses(), *layers, attacks={}, certify=True, **RUN)
+    bounds = tuple(float(attacks.sensitivity_bound(layer)) for layer in layers)
+    assert verdict.certified == pytest.approx(bounds, rel=1e-6)
+    assert "certified |du| / |p|" in str(verdict)
+
+
+def test_what_cannot_be_judged_is_named():
+    plant, own = dpc.systems.OscillatingMasses(), recorded(0)
+    with pytest.raises(ValueError, match="layers of the same recordings in the same order"):
+        tuning.judge(plant, own, recorded(1), attacks={}, **RUN)
+    with pytest.raises(ValueError, match="a layer for each of the same recordings, got 1 and 2"):
+        tuning.judge(plant, own, [own, own], attacks={}, **RUN)
+    with pytest.raises(ValueError, match="`attacks` must map names to callables"):
+        tuning.judge(plant, own, own, attacks=[3], **RUN)

@@ -14,6 +14,8 @@ A common factor on all four weights changes no plan. It is taken out: the mean o
 """
 
 from ..data.predictor import Predictor
+from .gain import plan_gain
+from .judge import attack_suite, judge
 from .objective import RobustObjective, Windows
 from .outcome import MeanError, OutputModel, QuadraticCost, RunCost
 from .parametrize import Positive, Semidefinite
@@ -38,7 +40,10 @@ __all__ = [
     "Verdict",
     "WeightScales",
     "Windows",
+    "attack_suite",
     "compare",
+    "judge",
+    "plan_gain",
     "scenarios",
     "tune",
 ]

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
@@ -14,11 +13,11 @@ from ..attacks.budgets import Budget
 from ..attacks.costs import Cost, check_cost
 from ..attacks.gradient import LinearizedAttack
 from ..checks import as_data, check_callable, check_count, check_number, check_type
-from ..data.predictor import Predictor
 from ..errors import Status
 from ..factors import Factored
 from ..layer import DPCLayer
 from ..reprs import Described
+from .gain import plan_gain
 from .outcome import OutputModel, QuadraticCost, RunCost
 from .scales import WeightScales, base_weight, with_weights
 
@@ -62,11 +61,13 @@ class RobustObjective(Described):
             it moves with the run, step 0 being the first of the run here. By default minus the cost of the plan in
             force: the attacker wants the worst.
         predictor: what inputs truly do: `tuning.Predictor(other_data)` of a recording that the layer has not seen, or a
-            model. By default the layer's own data, with a warning.
+            model. It must be given: data that judge their own plans let the objective fall while the closed loop gets
+            worse.
         cost: of a run; by default the quadratic one with the layer's present Q and R.
         plans: how many plans a run has, each from the window that the one before left.
         replan_every: steps of each plan that are applied; by default all.
         attacked_weight: of the cost under attack, beside a nominal one of weight 1.
+        gain_weight: of :func:`torch_dpc.tuning.plan_gain`, how strongly the plan answers to any perturbation at all.
         through: "danskin" or "attack".
         iterations: linearised steps of the attacker, each from the last answer; 1 is Algorithm 1. More raise a convex
             cost further, as the default psi is one between kinks.
@@ -78,8 +79,11 @@ class RobustObjective(Described):
         >>> data = HankelData.from_trajectories(u, y, t_ini=4, horizon=10)
         >>> layer = DPCLayer(data, Q=10.0, R=1.0, lambda_g=1.0, lambda_s=1e4)
         >>> windows = Windows(u[None, :4], y[None, :4], y_ref=torch.zeros(4))
-        >>> objective = RobustObjective(layer, windows, attacks.RelativeBall(0.1), plans=3, replan_every=5)
-        >>> from torch_dpc.tuning import tune
+        >>> other = collect(systems.OscillatingMasses(), 120, generator=torch.Generator().manual_seed(1))
+        >>> from torch_dpc.tuning import Predictor, tune
+        >>> predictor = Predictor(HankelData.from_trajectories(*other, t_ini=4, horizon=10))
+        >>> objective = RobustObjective(
+        ...     layer, windows, attacks.RelativeBall(0.1), predictor=predictor, plans=3, replan_every=5)
         >>> result = tune(objective, steps=3)
         >>> result.history[0]["total"] > result.best["total"]
         True
@@ -97,6 +101,7 @@ class RobustObjective(Described):
         plans: int = 1,
         replan_every: int | None = None,
         attacked_weight: float = 1.0,
+        gain_weight: float = 0.0,
         through: str = "attack",
         iterations: int = 1,
         attack: AttackMaker | None = None,
@@ -104,7 +109,13 @@ class RobustObjective(Described):
         check_type("layer", layer, DPCLayer)
         check_type("windows", windows, Windows)
         check_type("budget", budget, Budget)
-        for name, value in (("predictor", predictor), ("cost", cost), ("attack", attack)):
+        if predictor is None:
+            raise ValueError(
+                "`predictor` must say what inputs truly do, as the data of the layer would judge their own plans: give "
+                "tuning.Predictor(other_data) of another recording, or a model (u_ini, y_ini, u) -> y."
+            )
+        check_callable("predictor", predictor)
+        for name, value in (("cost", cost), ("attack", attack)):
             check_callable(name, value, optional=True)
         if psi is not None:
             check_cost(psi, "psi")
@@ -120,16 +131,11 @@ class RobustObjective(Described):
         if attack is not None and through != "danskin":
             raise ValueError('an `attack` of your own has no derivative here: take `through="danskin"`.')
         check_number("attacked_weight", attacked_weight)
+        check_number("gain_weight", gain_weight)
         self.layer, self.budget, self.psi, self.attack = layer, budget, psi, attack
         self.plans, self.replan_every, self.iterations = plans, replan_every, iterations
-        self.attacked_weight, self.through = attacked_weight, through
-        if predictor is None:
-            warnings.warn(
-                "without `predictor=` the data of the layer judge its own plans, and the closed loop may get worse as "
-                "the objective falls: give tuning.Predictor(other_data).",
-                stacklevel=2,
-            )
-        self.predictor = Predictor(layer.data) if predictor is None else predictor
+        self.attacked_weight, self.gain_weight, self.through = attacked_weight, gain_weight, through
+        self.predictor = predictor
         self.cost = _own_cost(layer) if cost is None else cost
         self.u_ini, self.y_ini = _past(windows)
         rows = (plans - 1) * replan_every + horizon
@@ -138,19 +144,27 @@ class RobustObjective(Described):
         self.u_ref = _reference("u_ref", u_ref, len(self.u_ini), rows, layer.data.n_u)
 
     def __call__(self, scales: WeightScales) -> dict[str, Tensor]:
-        """Return the mean over the windows: `nominal`, `attacked`, and `total`, their weighted sum."""
-        nominal, attacked = self.costs(scales)
-        return {
-            "nominal": nominal.mean(),
-            "attacked": attacked.mean(),
-            "total": nominal.mean() + self.attacked_weight * attacked.mean(),
-        }
+        """Return means over the windows, `nominal` and `attacked`, the `gain`, and `total`, their weighted sum.
+
+        The gain is left out where its weight is zero.
+        """
+        planner = self._planner(scales)
+        nominal, attacked = (cost.mean() for cost in self._costs(planner))
+        values = {"nominal": nominal, "attacked": attacked, "total": nominal + self.attacked_weight * attacked}
+        if self.gain_weight:
+            values["gain"] = plan_gain(planner)
+            values["total"] = values["total"] + self.gain_weight * values["gain"]
+        return values
 
     def costs(self, scales: WeightScales) -> tuple[Tensor, Tensor]:
         """Return the cost of every run, without and under attack, `(B,)` each."""
-        weights = scales(self.layer)
-        planner = with_weights(_FactoredOnce, self.layer, weights)
-        perturb = self._attacker(planner, weights)
+        return self._costs(self._planner(scales))
+
+    def _planner(self, scales: WeightScales) -> _FactoredOnce:
+        return with_weights(_FactoredOnce, self.layer, scales(self.layer))
+
+    def _costs(self, planner: DPCLayer) -> tuple[Tensor, Tensor]:
+        perturb = self._attacker(planner)
         B, data = len(self.u_ini), self.layer.data
         u_ini, y_ini = self.u_ini.repeat(2, 1, 1), self.y_ini.repeat(2, 1, 1)  # the nominal runs, then the attacked
         us, ys = [], []
@@ -172,11 +186,12 @@ class RobustObjective(Described):
         costs = self.cost(torch.cat(us, dim=1), torch.cat(ys, dim=1), *references)
         return costs[:B], costs[B:]
 
-    def _attacker(self, planner: DPCLayer, weights: dict[str, Tensor]) -> Callable[..., Tensor]:
+    def _attacker(self, planner: DPCLayer) -> Callable[..., Tensor]:
         psi = WorstRun(self.cost, self.predictor) if self.psi is None else self.psi
         if self.through == "attack" and torch.is_grad_enabled():
             return LinearizedAttack(planner, psi, self.budget, iterations=self.iterations, keeps_graph=True)
         constant = planner
+        weights = {name: getattr(planner, name) for name in ("Q", "R", "lambda_g", "lambda_s")}
         if any(w.requires_grad for w in weights.values()):
             constant = with_weights(_FactoredOnce, self.layer, {name: w.detach() for name, w in weights.items()})
         if self.attack is not None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeVar
 
 import torch
 from torch import Tensor, nn
@@ -56,7 +56,10 @@ class WeightScales(nn.Module):
         return nn.utils.parameters_to_vector(self.parameters()).detach().clone()
 
 
-def with_weights(kind: type[DPCLayer], layer: DPCLayer, weights: dict[str, Tensor]) -> DPCLayer:
+Kind = TypeVar("Kind", bound=DPCLayer)
+
+
+def with_weights(kind: type[Kind], layer: DPCLayer, weights: dict[str, Tensor]) -> Kind:
     """Return a layer of a kind with other weights, and everything else as it is."""
     return kind(layer.data, **{**layer.config(), **weights})
 

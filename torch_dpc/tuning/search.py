@@ -9,10 +9,11 @@ from dataclasses import dataclass
 
 import torch
 
-from ..checks import check_callable, check_count, check_number, check_type
+from ..checks import check_count, check_number, check_type
 from ..layer import DPCLayer
 from ..reprs import Described
 from .objective import RobustObjective
+from .progress import shown, silent
 from .scales import WeightScales
 
 
@@ -41,7 +42,7 @@ def tune(
     scales: WeightScales | None = None,
     limit: float = math.log(1e4),
     seconds: float = math.inf,
-    progress: Callable[[Mapping[str, float]], None] | None = None,
+    progress: Callable[[Mapping[str, float]], None] | bool = True,
 ) -> TuningResult:
     """Minimise the mean of the objectives over the scales by Adam, and keep the best seen.
 
@@ -52,7 +53,8 @@ def tune(
         scales: where to start; parameters that do not require a gradient stay.
         limit: how far each logarithm may move.
         seconds: no new evaluation is begun after this time.
-        progress: called with the row of every evaluation.
+        progress: True for a bar on a terminal (with tqdm; else lines of the logger "torch_dpc.tuning"), False for
+            nothing, or what is called with the row of every evaluation.
 
     Raises:
         ValueError: no objectives, or a start at which the objective is not finite.
@@ -67,12 +69,14 @@ def tune(
     for name, value in (("lr", lr), ("limit", limit)):
         check_number(name, value, positive=True)
     check_number("seconds", seconds, finite=False)
-    check_callable("progress", progress, optional=True)
+    if not isinstance(progress, bool) and not callable(progress):
+        raise ValueError(f"`progress` must be True, False or callable, got {progress!r}.")
     if scales is not None:
         check_type("scales", scales, WeightScales)
     scales = WeightScales(objectives[0].layer) if scales is None else scales
     free = [s for s in scales.parameters() if s.requires_grad]
     optimiser = torch.optim.Adam(free, lr=lr)
+    show = progress if callable(progress) else shown(steps) if progress else silent
     began = time.perf_counter()
     history: list[dict[str, float]] = []
     best, best_state = math.inf, scales.state_dict()
@@ -88,8 +92,7 @@ def tune(
             break  # the last good weights stand
         if row["total"] < best:
             best, best_state = row["total"], {k: v.clone() for k, v in scales.state_dict().items()}
-        if progress is not None:
-            progress(history[-1])
+        show(history[-1])
         if history[-1]["seconds"] > seconds:
             break
         optimiser.step()

@@ -117,6 +117,7 @@ class Verdict:
         before, after: mean errors, by scenario.
         change, low, high: mean change and its paired bootstrap interval, by scenario.
         runs: pairs in each.
+        certified: the certified bound of |du| / |p|, before and after; None if it was not asked for.
     """
 
     before: dict[str, float]
@@ -125,6 +126,7 @@ class Verdict:
     low: dict[str, float]
     high: dict[str, float]
     runs: int
+    certified: tuple[float, float] | None = None
 
     @property
     def worse(self) -> list[str]:
@@ -148,6 +150,9 @@ class Verdict:
             interval = f"{self.low[name]:.3g} to {self.high[name]:.3g}"
             numbers = (self.before[name], self.after[name], self.change[name])
             lines.append(f"{name:24}" + "".join(f"{x:11.4g}" for x in numbers) + f"{interval:>24}")
+        if self.certified is not None:
+            old, new = self.certified
+            lines.append(f"{'certified |du| / |p|':24}{old:11.4g}{new:11.4g}{new - old:11.4g}")
         return "\n".join(lines)
 
 
