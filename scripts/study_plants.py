@@ -7,8 +7,9 @@ Oscillating masses (linear), four tanks (an operating point far from zero), a po
 nonlinear) and the quadrotor follow a reference under four planners with the same weights: the paper's formulation, the
 affine one (1'g = 1), the affine one on the windows nearest to the present one, and predictive control with the true
 model, linearised at the operating point. Every measurement has noise, except in the true model. The error is the
-distance from the reference, averaged over the run, in the channels that count, and cut where the task is lost. Rows are
-saved as they are made: a run that is stopped goes on where it was (`--fresh` begins anew). Leaves, in results/:
+distance from the reference, averaged over the run, in the channels that count, and cut where the task is lost. The
+offset is the size of the mean deviation over the last tenth of the run, in which noise averages out. Rows are saved as
+they are made: a run that is stopped goes on where it was (`--fresh` begins anew). Leaves, in results/:
 
     study_plants.csv        one row a run
     study_plants.md, .png   median and band over the seeds
@@ -26,13 +27,13 @@ import torch
 from tqdm import tqdm
 
 import torch_dpc as dpc
-from scripts.experiments.plants import CASES, SMALL, PlantCase
+from scripts.experiments.plants import CASES, PlantCase
 from scripts.shared.command import arguments, versions
 from scripts.shared.plots import plt, style
 from scripts.shared.statistics import BAND, band
 from scripts.shared.tables import Table, as_they_finish
 
-COLUMNS = ("plant", "seed", "planner", "error", "last", "lost", "unsolved")
+COLUMNS = ("plant", "seed", "planner", "error", "last", "lost", "unsolved", "offset")
 PLANNERS = {
     "paper": ("the paper's formulation", "#d55e00"),
     "affine": ("affine", "#0072b2"),
@@ -44,7 +45,7 @@ PLANNERS = {
 def planner_of(name: str, case: PlantCase, seed: int) -> Any:
     """Return one of the planners."""
     if name == "model":
-        return dpc.DPCLayer(case.data(seed, SMALL), **case.weights, affine=True)
+        return dpc.DPCLayer(case.data_of_model(seed), **case.weights, affine=True)
     layer = dpc.DPCLayer(case.data(seed), **case.weights, affine=name != "paper")
     if name != "nearest":
         return layer
@@ -58,18 +59,21 @@ def attempt(plant: str, seed: int) -> list[dict[str, Any]]:
     case, rows = CASES[plant](), []
     for name in PLANNERS:
         log = case.follow(planner_of(name, case, seed), seed)
-        error = torch.linalg.vector_norm((log.y - log.y_ref)[:, case.channels], dim=1).nan_to_num(case.worst)
+        deviation = (log.y - log.y_ref)[:, case.channels]
+        error = torch.linalg.vector_norm(deviation, dim=1).nan_to_num(case.worst)
         lost = bool((error >= case.worst).any())
-        error = error.clamp_max(case.worst)
+        error, tenth = error.clamp_max(case.worst), len(error) // 10
+        offset = float(torch.linalg.vector_norm(deviation[-tenth:].mean(0)).nan_to_num(case.worst))
         rows.append(
             {
                 "plant": plant,
                 "seed": seed,
                 "planner": name,
                 "error": float(error.mean()),
-                "last": float(error[-len(error) // 10 :].mean()),
+                "last": float(error[-tenth:].mean()),
                 "lost": int(lost),
                 "unsolved": int((log.status != dpc.Status.SOLVED)[log.replanned].sum()),
+                "offset": min(offset, case.worst),
             }
         )
     return rows
@@ -83,13 +87,13 @@ def values_of(rows: Sequence[dict[str, str]], plant: str, planner: str, column: 
 
 def table(rows: Sequence[dict[str, str]], seeds: int) -> list[str]:
     """Return the lines of the table."""
-    head = ["plant", "planner", "mean error", "error of the last tenth", "lost", "plans without a solution"]
+    head = ["plant", "planner", "mean error", "error of the last tenth", "offset", "lost", "plans without a solution"]
     lines = ["| " + " | ".join(head) + " |", "|" + "---|" * len(head)]
     for plant, make in CASES.items():
         case = make()
         for planner, (label, _) in PLANNERS.items():
             cells = [case.name, label]
-            for column in ("error", "last"):
+            for column in ("error", "last", "offset"):
                 median, low, high = band(values_of(rows, plant, planner, column, seeds))
                 cells.append(f"{median:.3g} ({low:.3g} to {high:.3g}) {case.unit}")
             lost, unsolved = (int(values_of(rows, plant, planner, c, seeds).sum()) for c in ("lost", "unsolved"))

@@ -1,8 +1,8 @@
 """Four plants to follow a reference on: linear, affine, unstable, flying; each with its recording and its task.
 
 The reference for all data-driven plans is model predictive control with the true model, linearised at the operating
-point. It is the same problem on a noise-free recording of the linearised plant: the plant under deviations so small
-that it is linear, scaled up again (Willems' lemma makes the two the same).
+point by its Jacobian. It is the same problem on a noise-free recording of the linear model (Willems' lemma makes the
+two the same).
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from torch import Tensor
 
 import torch_dpc as dpc
 
-SMALL = 1e-7  # deviations at which a plant is linear, relative to those recorded
+FAINT = 1e-3  # deviations of the linear model, relative to the plant's: at these no feedback saturates
 ATTEMPT_SEED = 1000  # of the task, apart from the recording's
 
 
@@ -39,6 +39,9 @@ class PlantCase:
         recordings, samples: how many runs, and samples of each.
         spread: standard deviation of the states or positions at which recordings start; None starts each at rest.
         starts: (deviation) `(runs, ...)` -> arguments of the reset.
+        start: deviation at which the task starts, and
+        start_spread: its standard deviation over the seeds.
+        twin: the plant in torch, to linearise; None where `make` returns one.
         y_ref: the reference, `(steps, n_y)`.
         steps, replan_every: of the task.
         channels: whose error counts.
@@ -70,36 +73,75 @@ class PlantCase:
     recordings: int = 1
     samples: int = 400
     replan_every: int = 2
+    start: float | Tensor = 0.0
     start_spread: Tensor = field(default_factory=lambda: torch.zeros(1, dtype=torch.float64))
+    twin: Callable[[], Any] | None = None
 
-    def data(self, seed: int, size: float = 1.0) -> dpc.HankelData:
-        """Return a recording; a size below 1 shrinks every deviation and the noise is left out, then scales up."""
+    def data(self, seed: int) -> dpc.HankelData:
+        """Return a recording."""
         source = generator_of(seed)
-        plant = self.make(self.noise if size == 1.0 else 0 * self.noise, source)
-        starts = (
-            size * self.spread * torch.randn(self.recordings, len(self.spread), dtype=torch.float64, generator=source)
-        )
-        starts = starts if self.recordings > 1 else starts[0]
-        around, gain = self.feedback, size
-        feedback = None if around is None else lambda y: gain * around((y - self.y0) / gain)
-        amplitude = size * torch.as_tensor(self.amplitude, dtype=torch.float64)
-        u, y = dpc.collect(
-            plant, self.samples, generator=source, amplitude=amplitude, offset=self.u0, hold=self.hold,
-            feedback=feedback, reset=self.starts(starts),
+        starts = self.spread * torch.randn(self.recordings, len(self.spread), dtype=torch.float64, generator=source)
+        return self._record(
+            self.make(self.noise, source), source, offset=self.u0, feedback=self.feedback,
+            reset=self.starts(starts if self.recordings > 1 else starts[0]),
         )  # fmt: skip
-        if size != 1.0:
-            u, y = self.u0 + (u - self.u0) / size, self.y0 + (y - self.y0) / size
-        u, y = (w if w.ndim == 3 else w[None] for w in (u, y))
+
+    def model(self) -> dpc.systems.StateSpace:
+        """Return the true model, linearised at the operating point: deviations from it, without noise."""
+        plant = self.make(0 * self.noise, generator_of(0)) if self.twin is None else self.twin()
+        plant.reset(**self.starts(0 * self.spread))
+        return linearised(plant, self.u0)
+
+    def data_of_model(self, seed: int) -> dpc.HankelData:
+        """Return a recording of the linearised model around the operating point."""
+        around = self.feedback
+        feedback = None if around is None else lambda y: around(self.y0 + FAINT * y) / FAINT
+        reset = {"batch": self.recordings} if self.recordings > 1 else {}
+        return self._record(self.model(), generator_of(seed), feedback=feedback, reset=reset, at=(self.u0, self.y0))
+
+    def _record(self, plant: Any, source: torch.Generator, *, at: Any = (0.0, 0.0), **options: Any) -> dpc.HankelData:
+        """Return a recording of a plant, moved to an operating point."""
+        amplitude = torch.as_tensor(self.amplitude, dtype=torch.float64)
+        u, y = dpc.collect(plant, self.samples, generator=source, amplitude=amplitude, hold=self.hold, **options)
+        u, y = (w + place if w.ndim == 3 else w[None] + place for w, place in zip((u, y), at, strict=True))
         return dpc.HankelData.from_trajectories(list(u), list(y), t_ini=self.t_ini, horizon=self.horizon)
 
     def follow(self, planner: Any, seed: int) -> dpc.ClosedLoopLog:
         """Return one run of the task."""
         source = generator_of(ATTEMPT_SEED + seed)
-        start = self.start_spread * torch.randn(len(self.spread), dtype=torch.float64, generator=source)
+        drawn = torch.randn(len(self.spread), dtype=torch.float64, generator=source)
+        start = self.start + self.start_spread * drawn
         return dpc.simulate(
             self.make(self.noise, source), dpc.DPCController(planner, self.replan_every, on_failure="hold"), self.y_ref,
             steps=len(self.y_ref), u_ref=self.u0, u_warmup=self.u0, reset=self.starts(start),
         )  # fmt: skip
+
+
+def linearised(plant: Any, u0: Tensor) -> dpc.systems.StateSpace:
+    """Return the model of a torch plant's deviations from where it stands, under inputs around u0, by its Jacobian."""
+    here = plant.snapshot()
+    parts = [x for x in here if x.is_floating_point()]
+    sizes = [x.numel() for x in parts]
+
+    def flat(snapshot: tuple[Tensor, ...]) -> Tensor:
+        return torch.cat([x.reshape(-1) for x in snapshot if x.is_floating_point()])
+
+    def put(state: Tensor) -> None:
+        moved = iter(x.reshape(like.shape) for x, like in zip(state.split(sizes), parts, strict=True))
+        plant.restore(tuple(next(moved) if x.is_floating_point() else x for x in here))
+
+    def step(state: Tensor, u: Tensor) -> Tensor:
+        put(state)
+        plant.step(u)
+        return flat(plant.snapshot())
+
+    def measure(state: Tensor) -> Tensor:
+        put(state)
+        y: Tensor = plant.measure()
+        return y
+
+    A, B = torch.autograd.functional.jacobian(step, (flat(here), u0))
+    return dpc.systems.StateSpace(A, B, torch.autograd.functional.jacobian(measure, flat(here)), dt=plant.dt)
 
 
 def row(*values: float) -> Tensor:
@@ -136,9 +178,9 @@ def four_tanks() -> PlantCase:
     return PlantCase(
         name="four tanks",
         make=lambda noise, source: dpc.systems.FourTanks(measurement_noise=noise, generator=source),
-        noise=row(0.02, 0.02), u0=tanks.voltages, y0=y0, amplitude=0.8, hold=4,
+        noise=row(0.02, 0.02), u0=tanks.voltages, y0=y0, amplitude=1.5, hold=4, samples=800,
         y_ref=steps_between([y0 + 3.0, y0 - 3.0], 80), channels=[0, 1], unit="cm", worst=6.0,
-        t_ini=3, horizon=20, k=150, lambda_near=1.0, starts=lambda x: {"state": tanks.x0 + 0 * x},
+        t_ini=3, horizon=20, k=250, lambda_near=1.0, starts=lambda x: {"state": tanks.x0 + 0 * x},
         spread=row(*4 * [0.0]),
         weights={"Q": 1.0, "R": 0.0, "R_du": 0.1, "lambda_g": 10.0, "lambda_s": 1e3, "u_set": dpc.Box(0.0, 8.0)},
     )  # fmt: skip
@@ -185,7 +227,7 @@ def quadrotor() -> PlantCase:
         amplitude=0.5, hold=10, feedback=lambda y: -0.3 * y[..., :3], samples=530,
         y_ref=torch.cat([centre + 0.3 * circle, flat], dim=1), channels=[0, 1, 2], unit="m", worst=2.0,
         t_ini=6, horizon=25, k=300, lambda_near=1.0, replan_every=5, spread=row(0.0, 0.0, 0.0),
-        starts=lambda x: {"position": centre + x + (0.3 * circle[0] if x.ndim == 1 else 0.0)},
+        starts=lambda x: {"position": centre + x}, start=0.3 * circle[0], twin=dpc.systems.TorchQuadrotor,
         weights={"Q": torch.diag(row(10.0, 10.0, 10.0, 0.0, 0.0, 0.0)), "R": 1.0, "lambda_g": 100.0, "lambda_s": 1e4,
                  "u_set": dpc.Box(-1.0, 1.0), "y_set": dpc.SoftBox(y0 - limit, y0 + limit, 1e3)},
     )  # fmt: skip
