@@ -33,6 +33,7 @@ class ConfiguredModule(nn.Module):
     u_set: ConvexSet
     y_set: ConvexSet
     du_set: ConvexSet | None
+    slack_set: ConvexSet | None
     regularizer: str
     terminal_steps: int
     affine: bool
@@ -63,7 +64,8 @@ class ConfiguredModule(nn.Module):
     @property
     def _given(self) -> GivenWeights:
         """The weights as they are now."""
-        return GivenWeights(self.Q, self.R, self.lambda_g, self.lambda_s, self.lambda_u, self.R_du, self.Q_terminal)
+        weights = (self.Q, self.R, self.lambda_g, self.lambda_s, self.lambda_u, self.R_du, self.Q_terminal, self.beta_2)
+        return GivenWeights(*weights)
 
     @property
     def backward(self) -> str:
@@ -91,7 +93,7 @@ class ConfiguredModule(nn.Module):
 
     @property
     def reduced_kkt_size(self) -> int:
-        """Unknowns of the reduced system: horizon (n_u + n_y), horizon n_u more where changes of the input count."""
+        """Unknowns of the reduced system: horizon (n_u + n_y), and more with `R_du`, `du_set` or `slack_set`."""
         return self.sizes.v
 
     @property
@@ -106,11 +108,9 @@ class ConfiguredModule(nn.Module):
 
     def own_tensors(self) -> list[Tensor]:
         """Return the weights that are tensors, then the parameters of the sets."""
-        weights = (self.Q, self.R, self.R_du, self.lambda_g, self.lambda_s, self.lambda_u, self.Q_terminal)
-        sets = [self.u_set, self.y_set] if self.du_set is None else [self.u_set, self.y_set, self.du_set]
-        found = [weight for weight in weights if isinstance(weight, Tensor)]
-        for owner in sets:
-            found += list(owner.parameters())
+        found = [weight for weight in self._given if isinstance(weight, Tensor)]
+        for owner in (self.u_set, self.y_set, self.du_set, self.slack_set):
+            found += [] if owner is None else list(owner.parameters())
         return found
 
     def flatten(self, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any) -> tuple[Tensor, torch.dtype]:

@@ -124,10 +124,12 @@ def problem_of(setup: Setup, given: GivenWeights, device: torch.device) -> Probl
     weights = Weights(
         Q=output_weight(given.Q, given.Q_terminal, data.n_y, data.horizon).to(device),
         R=weight_matrix("R", given.R, data.n_u, data.horizon).to(device),
-        lambda_g=penalty("lambda_g", given.lambda_g).to(device),
+        # Subspace predictive control has no lambda_g; coordinates that pad a batch are charged.
+        lambda_g=penalty("lambda_g", 1.0 if setup.terms.regularizer == "spc" else given.lambda_g).to(device),
         lambda_s=penalty("lambda_s", given.lambda_s).to(device),
         lambda_u=None if given.lambda_u is None else penalty("lambda_u", given.lambda_u).to(device),
         R_du=None if given.R_du is None else weight_matrix("R_du", given.R_du, data.n_u, data.horizon).to(device),
+        beta_2=None if given.beta_2 is None else penalty("beta_2", given.beta_2).to(device),
     )
     problem = Problem(data, weights, setup.sets, setup.terms)
     one_batch(problem.batches)

@@ -38,6 +38,9 @@ class DPCLayer(ConfiguredModule):
     Beyond the paper, each exact in the reduction and differentiable:
 
         regularizer="identity"   lambda_g |g|^2 in place of lambda_g |M g|^2
+        regularizer="spc"        M g = 0, subspace predictive control: the limit of a large lambda_g
+        regularizer="gamma"      + beta_2 |gamma_2|^2, gamma_2 the part of g that the future input adds to the past
+        slack_set                Yp g - y_ini in a set, or at a price: SoftBox(0.0, 0.0, w) adds w |Yp g - y_ini|_1
         lambda_u                 lambda_u |Up g - u_ini|^2 in place of Up g = u_ini
         R_du, du_set             + 1/2 |du|_R_du^2 and du in DU, du_t = u_t - u_(t-1), from the last of u_ini on
         terminal_steps           the last outputs of the plan equal their reference
@@ -48,13 +51,21 @@ class DPCLayer(ConfiguredModule):
         data: the recorded trajectories.
         Q: output weight, positive semidefinite: a number, `(n_y, n_y)`, or `(horizon n_y, horizon n_y)`.
         R: input weight, likewise.
-        lambda_g: regularisation of the part of g that the past and the future input do not explain.
+        lambda_g: regularisation of the part of g that the past and the future input do not explain; without effect
+            with `regularizer="spc"`.
         lambda_s: penalty on the mismatch of the initial output.
         u_set, y_set: constraints on every step's input and output, any :class:`ConvexSet`; `None` for none.
         du_set: constraint on every step's change of the input.
         R_du: weight of the changes of the input, given like R; `None` for none.
         lambda_u: penalty on the mismatch of the initial input; `None` where that is to be exact.
-        regularizer: "projection", the paper's |M g|^2, or "identity", |g|^2.
+        regularizer: "projection", the paper's |M g|^2; "identity", |g|^2; "spc", where outputs are those of the
+            least-squares predictor of (u_ini, Yp g, u) (Favoreel, De Moor, Gevers, "SPC: subspace predictive control",
+            IFAC 1999); or "gamma" (Breschi, Chiuso, Formentin, "Data-driven predictive control in a stochastic setting:
+            a unified framework", Automatica 2023), with lambda_g the weight of gamma_3, for |M g| = |gamma_3|.
+        beta_2: weight of |gamma_2|^2; with `regularizer="gamma"` alone.
+        slack_set: constraint or penalty on the mismatch Yp g - y_ini, beside lambda_s, for every step of the past, any
+            :class:`ConvexSet`; the 1-norm is that of Coulson, Lygeros, Doerfler, "Data-enabled predictive control: in
+            the shallows of the DeePC" (2019).
         terminal_steps: so many last outputs equal y_ref.
         affine: combine the recorded windows with 1'g = 1 (Berberich, Koehler, Mueller, Allgoewer, "Linear tracking MPC
             for nonlinear systems - part II: the data-driven case", 2022): the data need not be centred, and predictions
@@ -94,6 +105,8 @@ class DPCLayer(ConfiguredModule):
         R_du: Any = None,
         lambda_u: Any = None,
         regularizer: str = "projection",
+        beta_2: Any = None,
+        slack_set: ConvexSet | None = None,
         terminal_steps: int = 0,
         affine: bool = False,
         Q_terminal: Any = None,
@@ -104,10 +117,10 @@ class DPCLayer(ConfiguredModule):
         super().__init__()
         self.data = data
         self.Q, self.R, self.lambda_g, self.lambda_s = Q, R, lambda_g, lambda_s
-        self.lambda_u, self.R_du, self.Q_terminal = lambda_u, R_du, Q_terminal
+        self.lambda_u, self.R_du, self.Q_terminal, self.beta_2 = lambda_u, R_du, Q_terminal, beta_2
         self.u_set = Reals() if u_set is None else u_set
         self.y_set = Reals() if y_set is None else y_set
-        self.du_set = du_set
+        self.du_set, self.slack_set = du_set, slack_set
         self.regularizer = regularizer
         self.terminal_steps = terminal_steps
         self.affine = affine
@@ -155,11 +168,10 @@ class DPCLayer(ConfiguredModule):
     def _traced(self, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any, on_failure: str | None) -> DPCSolution:
         """Plan by an operator, while torch compiles or exports."""
         text, tensors = described(self) if torch.compiler.is_exporting() else ("", self.own_tensors())
-        data, weights = self.data, (self.Q, self.R, self.R_du, self.lambda_g, self.lambda_s, self.lambda_u)
-        batches = batches_of(data, (*weights, self.Q_terminal))
+        data = self.data
+        batches = batches_of(data, self._given)
         theta, dtype = flat_parameters(data, u_ini, y_ini, y_ref, u_ref, batches, affine=self.affine)
-        rates = self.R_du is not None or self.du_set is not None
-        sizes = [data.horizon, data.n_u, data.n_y, data.horizon * data.n_u if rates else 0]
+        sizes = [data.horizon, data.n_u, data.n_y, self.sizes.more]
         on_failure = self.on_failure if on_failure is None else on_failure
         return planned_by_operator(theta, tensors, self._handle, text, on_failure, sizes, dtype)
 
@@ -180,7 +192,7 @@ class DPCLayer(ConfiguredModule):
 
         Args:
             theta: (u_ini, y_ini, u_ref, y_ref) flattened, `(*batch, n_theta)`, float64.
-            lower, upper: bounds of (u, y, du) flattened, `(N,)` or one a sample, float64.
+            lower, upper: bounds of (u, y, du, slack) flattened, `(N,)` or one a sample, float64.
             dtype: of the plan.
             on_failure: in place of the layer's own.
         """
@@ -201,7 +213,7 @@ class DPCLayer(ConfiguredModule):
         return isinstance(self._factors.sets(self._setup, self.data.device), Bounds)
 
     def bounds(self, device: torch.device) -> tuple[Tensor, Tensor]:
-        """Return the bounds of (u, y, du) flattened, `(N,)` or `(*batch, N)` each, float64, with their graph.
+        """Return the bounds of (u, y, du, slack) flattened, `(N,)` or `(*batch, N)` each, float64, with their graph.
 
         Raises:
             ValueError: a set is no box.
@@ -223,6 +235,8 @@ class DPCLayer(ConfiguredModule):
             raise ValueError("`compact_form` takes one problem; the weights or the data have a batch dimension.")
         if self.du_set is not None:
             raise ValueError("`compact_form` has no rows for changes of the input; leave out `du_set`.")
+        if self.slack_set is not None:
+            raise ValueError("`compact_form` has no rows for Yp g - y_ini; leave out `slack_set`.")
         return compact_form(data, weights, theta, self.terms)
 
     def config(self) -> dict[str, Any]:
@@ -238,6 +252,8 @@ class DPCLayer(ConfiguredModule):
             "R_du": self.R_du,
             "lambda_u": self.lambda_u,
             "regularizer": self.regularizer,
+            "beta_2": self.beta_2,
+            "slack_set": self.slack_set,
             "terminal_steps": self.terminal_steps,
             "affine": self.affine,
             "Q_terminal": self.Q_terminal,

@@ -14,13 +14,13 @@ from typing import Any, NamedTuple
 from .checks import as_index, cure
 from .data.hankel import HankelData
 from .data.hankel_batch import HankelBatch
-from .problem.terms import Sizes, Terms
+from .problem.terms import REGULARIZERS, Sizes, Terms
 from .sets import ConvexSet, Reals
 from .sets.feasible import FeasibleSet, identity_key
 
 #: The settings that take one of a few words.
 CHOICES = {
-    "regularizer": ("projection", "identity"),
+    "regularizer": REGULARIZERS,
     "backward": ("reduced", "full"),
     "solver": ("auto", "newton", "daqp"),
     "on_failure": ("raise", "nan"),
@@ -37,6 +37,7 @@ class GivenWeights(NamedTuple):
     lambda_u: Any
     R_du: Any
     Q_terminal: Any
+    beta_2: Any
 
 
 class Settings(NamedTuple):
@@ -49,10 +50,12 @@ class Settings(NamedTuple):
     u_set: tuple[Any, ...]
     y_set: tuple[Any, ...]
     du_set: tuple[Any, ...] | None
+    slack_set: tuple[Any, ...] | None
     regularizer: str
     terminal_steps: int
     has_lambda_u: bool
     has_R_du: bool
+    has_beta_2: bool
     affine: bool
     backward: str
     solver: str
@@ -64,16 +67,18 @@ class Settings(NamedTuple):
         They are read at every call, and a module's own access to its children takes 0.3 us each.
         """
         modules = held["_modules"]
-        du_set = modules.get("du_set")
+        du_set, slack_set = modules.get("du_set"), modules.get("slack_set")
         return Settings(
             held["data"],
             identity_key(modules["u_set"]),
             identity_key(modules["y_set"]),
             None if du_set is None else identity_key(du_set),
+            None if slack_set is None else identity_key(slack_set),
             held["regularizer"],
             held["terminal_steps"],
             _is_given("lambda_u", held),
             _is_given("R_du", held),
+            _is_given("beta_2", held),
             held["affine"],
             held["backward_system"],
             held["solver"],
@@ -120,13 +125,22 @@ class Setup:
                 f"`terminal_steps` must be an integer from 0 to the horizon, {data.horizon}, got {steps!r}."
             )
         rates = settings.has_R_du or settings.du_set is not None
-        terms = Terms(settings.regularizer == "identity", settings.has_lambda_u, rates, steps, settings.affine)
+        mismatch = settings.slack_set is not None
+        terms = Terms(settings.regularizer, settings.has_lambda_u, rates, steps, settings.affine, mismatch)
+        if settings.has_beta_2 != (terms.regularizer == "gamma"):
+            raise ValueError(
+                '`regularizer="gamma"` needs `beta_2`, the weight of gamma_2, and no other regularizer has it; got '
+                f"`regularizer={terms.regularizer!r}` with{'' if settings.has_beta_2 else 'out'} `beta_2`."
+            )
         if terms.slack and terms.rates:
             raise ValueError("`R_du` and `du_set` count from the last u_ini, which `lambda_u` leaves open: give one.")
-        named = [("u_set", settings.u_set[0], data.n_u), ("y_set", settings.y_set[0], data.n_y)]
+        horizon = data.horizon
+        named = [("u_set", settings.u_set[0], horizon, data.n_u), ("y_set", settings.y_set[0], horizon, data.n_y)]
         if rates:
-            named.append(("du_set", Reals() if settings.du_set is None else settings.du_set[0], data.n_u))
-        sets = FeasibleSet.of((name, owner, data.horizon, n) for name, owner, n in named)
+            named.append(("du_set", Reals() if settings.du_set is None else settings.du_set[0], horizon, data.n_u))
+        if settings.slack_set is not None:
+            named.append(("slack_set", settings.slack_set[0], data.t_ini, data.n_y))
+        sets = FeasibleSet.of(named)
         sets.check_engine(settings.solver)
         return Setup(data, terms, Sizes.of(data, terms), sets, settings.backward, settings.solver)
 
@@ -144,6 +158,13 @@ def check_choice(name: str, value: Any) -> str:
     Raises:
         ValueError: another word.
     """
+    if name == "regularizer" and value in ("l1", "1-norm"):
+        raise ValueError(
+            f"`regularizer` must be one of {', '.join(map(repr, CHOICES[name]))}, got {value!r}: the 1-norm of g is "
+            "not invariant under rotations of g, so a problem with it does not reduce to the row space of the data. "
+            "For a plan from few windows use `NearestWindows`; for a 1-norm of the slack give "
+            "`slack_set=SoftBox(0.0, 0.0, price)`."
+        )
     choices = CHOICES[name]
     if not isinstance(value, str) or value not in choices:
         raise ValueError(f"`{name}` must be one of {', '.join(map(repr, choices))}, got {value!r}.")
@@ -189,6 +210,7 @@ VALIDATORS: Mapping[str, Callable[[str, Any], Any]] = {
     "u_set": _set,
     "y_set": _set,
     "du_set": _set_or_none,
+    "slack_set": _set_or_none,
     "terminal_steps": _steps,
     "affine": _flag,
     "regularizer": check_choice,

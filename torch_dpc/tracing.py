@@ -83,8 +83,8 @@ def planned_by_operator(
 
 
 def batches_of(data: HankelData | HankelBatch, weights: tuple[Any, ...]) -> list[torch.Size]:
-    """Return the batch shapes of the data and of (Q, R, R_du, lambda_g, lambda_s, lambda_u, Q_terminal)."""
-    tails = (2, 2, 2, 0, 0, 0, 2)
+    """Return the batch shapes of the data and of the weights, in the order of `GivenWeights`."""
+    tails = (2, 2, 0, 0, 0, 2, 2, 0)
     found = [
         w.shape[: w.ndim - tail]
         for w, tail in zip(weights, tails, strict=True)

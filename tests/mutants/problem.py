@@ -4,7 +4,8 @@ from .mutant import Mutant as M
 
 RED, ROWS = "torch_dpc/problem/reduction.py", "torch_dpc/problem/rows.py"
 OPT, TERMS, REDUCTION = "solve/test_optimality.py", "problem/test_terms.py", "problem/test_reduction.py"
-GRAD = "solve/test_gradients.py"
+GRAD, FORMULATIONS = "solve/test_gradients.py", "problem/test_formulations.py"
+REGULARIZERS = "torch_dpc/problem/regularizers.py"
 
 MUTANTS = [
     M(
@@ -31,12 +32,40 @@ MUTANTS = [
     M("u_ref ignored", ROWS, 'Tracking("R", slice(0, len(Uf)), u_ref)', 'Tracking("R", slice(0, len(Uf)), None)', OPT),
     M(
         "M charges one direction too few",
-        ROWS,
-        ">= (0 if terms.identity else space.rank_W)",
-        "> (0 if terms.identity else space.rank_W)",
+        REGULARIZERS,
+        "torch.arange(rank, device=device) >= first",
+        "torch.arange(rank, device=device) > first",
         OPT + " " + REDUCTION,
     ),
-    M("identity charged like the projection", ROWS, "(0 if terms.identity else space.rank_W)", "space.rank_W", TERMS),
+    M(
+        "identity charged like the projection",
+        REGULARIZERS,
+        'first = 0 if regularizer == "identity" else rank_W',
+        "first = rank_W",
+        TERMS,
+    ),
+    M(
+        "gamma_2 begins with the past inputs",
+        REGULARIZERS,
+        "Z = W[:n_past]",
+        "Z = W[: n_past - 1]",
+        FORMULATIONS,
+    ),
+    M("gamma_2 does not turn with W", REGULARIZERS, "return N + of_W -", "return N -", FORMULATIONS),
+    M(
+        "the row space of W does not turn with the data",
+        REGULARIZERS,
+        "return kept + rows[:, rank_W:] @ (change",
+        "return kept + 0 * rows[:, rank_W:] @ (change",
+        FORMULATIONS,
+    ),
+    M(
+        "the slack has the sign of the data alone",
+        ROWS,
+        "equal.append(Yp - torch.eye(",
+        "equal.append(Yp + torch.eye(",
+        FORMULATIONS,
+    ),
     M(
         "the change of u counts from zero",
         ROWS,
@@ -48,8 +77,8 @@ MUTANTS = [
     M(
         "terminal reference is the first one",
         ROWS,
-        "places.append(torch.arange(n_theta - last, n_theta))",
-        "places.append(torch.arange(y_ref, y_ref + last))",
+        "places.append(torch.arange(len(rows) - last, len(rows)))",
+        "places.append(torch.arange(len(rows) - len(Yf), len(rows) - len(Yf) + last))",
         TERMS,
     ),
     M(

@@ -15,6 +15,10 @@ EXACT = 1e-10
 U_REF = torch.tensor([1.0, -0.5], dtype=torch.float64)
 TERMS = {
     "identity": {"regularizer": "identity"},
+    "spc": {"regularizer": "spc"},
+    "gamma": {"regularizer": "gamma", "beta_2": 3.0},
+    "affine, gamma, slack": {"affine": True, "regularizer": "gamma", "beta_2": 3.0, "lambda_u": 5.0},
+    "affine, spc, rate cost": {"affine": True, "regularizer": "spc", "R_du": 2.0},
     "slack": {"lambda_u": 50.0},
     "rate cost": {"R_du": torch.tensor([[3.0, 1.0], [1.0, 2.0]], dtype=torch.float64)},
     "terminal": {"terminal_steps": 1},
@@ -55,7 +59,13 @@ def by_hand(layer, options, u_ini, y_ini):
     Q = torch.full((h, 4), SMALL["Q"], dtype=torch.float64)
     Q[-1] = options["Q_terminal"].diagonal() if "Q_terminal" in options else Q[-1]
     charge(torch.diag(Q.flatten().sqrt()), Yf, Y_REF.repeat(h))
-    charge(eye * (2 * SMALL["lambda_g"]) ** 0.5, N, torch.zeros(data.n_g, dtype=torch.float64))
+    none = torch.zeros(data.n_g, dtype=torch.float64)
+    if options.get("regularizer") != "spc":
+        charge(eye * (2 * SMALL["lambda_g"]) ** 0.5, N, none)
+    if "beta_2" in options:
+        past = torch.cat([Up, Yp, ones]) if "affine" in options else torch.cat([Up, Yp])
+        explained = torch.linalg.pinv(W) @ W - torch.linalg.pinv(past) @ past
+        charge(eye * (2 * options["beta_2"]) ** 0.5, explained, none)
     charge(torch.eye(len(Yp)).double() * (2 * SMALL["lambda_s"]) ** 0.5, Yp, y_ini.flatten())
     if "R_du" in options:
         S = options["R_du"]
@@ -72,6 +82,9 @@ def by_hand(layer, options, u_ini, y_ini):
     else:
         held.append(Up)
         values.append(u_ini.flatten())
+    if options.get("regularizer") == "spc":
+        held.append(torch.linalg.svd(W)[2][len(W) :])
+        values.append(none[len(W) :])
     if steps := options.get("terminal_steps"):
         held.append(Yf[-4 * steps :])
         values.append(Y_REF.repeat(steps))
@@ -120,7 +133,8 @@ def test_the_papers_map_vanishes_on_the_compact_form(name, bounded):
 def test_gradients_are_those_of_differences(name, which):
     (u_ini, y_ini), h = inputs(), 6
     point = {"u_ini": u_ini, "y_ini": y_ini, "y_ref": Y_REF + 0.1 * randn(3, h, 4, seed=8), "u_ref": randn(3, h, 2)}
-    weight = next((k for k in ("R_du", "lambda_u") if k in TERMS[name]), "lambda_g")
+    weight = next((k for k in ("beta_2", "R_du", "lambda_u") if k in TERMS[name]), None)
+    weight = weight or ("lambda_s" if "spc" in name else "lambda_g")
     start = torch.as_tensor(TERMS[name].get(weight, SMALL.get(weight)), dtype=torch.float64)
     value = start if which == "weight" else point[which]
 
@@ -198,6 +212,12 @@ def test_rate_terms_add_rows_and_the_size_says_so():
     ("options", "says"),
     [
         ({"regularizer": "ridge"}, "`regularizer` must be one of"),
+        ({"regularizer": "l1"}, "1-norm of g is not invariant under rotations"),
+        ({"regularizer": "1-norm"}, "slack_set=SoftBox"),
+        ({"regularizer": "gamma"}, "needs `beta_2`"),
+        ({"regularizer": "spc", "beta_2": 1.0}, "no other regularizer has it"),
+        ({"regularizer": "gamma", "beta_2": -1.0}, "`beta_2` must not be negative"),
+        ({"slack_set": 1.0}, "`slack_set` must be a ConvexSet"),
         ({"terminal_steps": 7}, "`terminal_steps` must be an integer from 0 to the horizon, 6"),
         ({"terminal_steps": 1.0}, "`terminal_steps` must be an integer"),
         ({"lambda_u": -1.0}, "`lambda_u` must not be negative"),
@@ -215,5 +235,7 @@ def test_forms_that_do_not_know_a_term_say_so():
     u_ini, y_ini = inputs(1)
     with pytest.raises(ValueError, match="no rows for changes"):
         dpc.DPCLayer(small_data(), **SMALL, du_set=dpc.Box(-1.0, 1.0)).compact_form(u_ini[0], y_ini[0])
+    with pytest.raises(ValueError, match="no rows for Yp g"):
+        dpc.DPCLayer(small_data(), **SMALL, slack_set=dpc.Box(-1.0, 1.0)).compact_form(u_ini[0], y_ini[0])
     with pytest.raises(ValueError, match='backward="full" is the system of the paper'):
         dpc.DPCLayer(small_data(), **SMALL, lambda_u=1.0, backward="full")(u_ini[0], y_ini[0])

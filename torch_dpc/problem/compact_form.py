@@ -43,8 +43,8 @@ def compact_form(data: HankelData, weights: Weights, theta: Tensor, terms: Terms
     """Return P, q, H, b as the paper writes them, with what the problem has beyond the paper's.
 
     For affine systems 1'g = 1 is the first row of H. A slack on u_ini moves Up from H to P, a weight on changes of the
-    input widens R, and terminal steps are more rows of H. A set of the changes is no part of z in D: it has no compact
-    form.
+    input widens R, and terminal steps are more rows of H. Subspace predictive control has rows K'g = 0, K a basis of
+    the kernel of W. A set of the changes or of the slack is no part of z in D: it has no compact form.
 
     Args:
         data: the recorded data.
@@ -60,8 +60,7 @@ def compact_form(data: HankelData, weights: Weights, theta: Tensor, terms: Terms
     Up, Yp, Uf, Yf = (m.detach().to(theta) for m in data.matrices)
     Q, R = weights.Q.to(theta), weights.R.to(theta)
     u_ini, y_ini, u_ref, y_ref = theta.split(sizes.theta, dim=-1)
-    M = torch.eye(data.n_g, dtype=theta.dtype, device=theta.device) if terms.identity else projector(data).to(theta)
-    of_g = 2 * weights.lambda_g * (M.T @ M) + 2 * weights.lambda_s * (Yp.T @ Yp)
+    of_g = 2 * weights.lambda_s * (Yp.T @ Yp) + _of_regularizer(data, weights, terms).to(theta)
     q_u, q_g = u_ref @ R, 2 * weights.lambda_s * (y_ini @ Yp)
     if weights.R_du is not None:
         S = weights.R_du.to(theta)
@@ -86,4 +85,23 @@ def compact_form(data: HankelData, weights: Weights, theta: Tensor, terms: Terms
         last = terms.terminal_steps * data.n_y
         H.append(torch.cat([eye[-last:], eye.new_zeros(last, data.n_g)], dim=1))
         b.append(y_ref[..., -last:])
+    if terms.regularizer == "spc":
+        W = data.basis[:, : data.row_space.rank_W].to(theta)
+        beyond = torch.linalg.qr(W, mode="complete").Q[:, W.shape[1] :].mT
+        H.append(torch.nn.functional.pad(beyond, (n_v, 0)))
+        b.append(theta.new_zeros(*theta.shape[:-1], len(beyond)))
     return CompactForm(P, q, torch.cat(H), torch.cat(b, dim=-1))
+
+
+def _of_regularizer(data: HankelData, weights: Weights, terms: Terms) -> Tensor:
+    """Return the part of P that regularises g, `(n_g, n_g)`."""
+    if terms.regularizer == "spc":
+        return torch.zeros(data.n_g, data.n_g, dtype=torch.float64)
+    M = torch.eye(data.n_g, dtype=torch.float64) if terms.regularizer == "identity" else projector(data).cpu()
+    of_g = 2 * weights.lambda_g.cpu() * (M.T @ M)
+    if weights.beta_2 is None:
+        return of_g
+    past = torch.cat([m.detach().double().cpu() for m in (data.Up, data.Yp)])
+    past = past / data.row_space.units.cpu()[: len(past), None]
+    explained = torch.linalg.pinv(past, rtol=data.rank_tolerance) @ past
+    return of_g + 2 * weights.beta_2.cpu() * (torch.eye(data.n_g, dtype=torch.float64) - M - explained)

@@ -28,7 +28,7 @@ def optimal_cost(reduction: Reduction, theta: Tensor, lam: Tensor, v: Tensor, se
         reduction: with its graph.
         theta: (u_ini, y_ini, u_ref, y_ref), `(*batch, n_theta)`.
         lam: optimal multipliers, `(*batch, N)`.
-        v: the constrained rows (u, y, du), `(*batch, N)`; only sets without a `conjugate` of their own need it.
+        v: the constrained rows (u, y, du, slack), `(*batch, N)`; only sets without a `conjugate` of their own need it.
         sets: with their present parameters and their graph.
 
     Raises:
@@ -52,7 +52,9 @@ def terms_of_cost(reduction: Reduction, theta: Tensor, a: Tensor) -> Tensor:
             error = error - theta[..., term.reference : term.reference + error.shape[-1]]
         total = total + (error * times(weight, error)).sum(-1) / 2
     for fit in rows.fits:
-        error = times(fit.rows, a) - theta[..., fit.measured : fit.measured + fit.rows.shape[-2]]
+        error = times(fit.rows, a)
+        if fit.measured is not None:
+            error = error - theta[..., fit.measured : fit.measured + fit.rows.shape[-2]]
         total = total + getattr(weights, fit.weight) * error.square().sum(-1)
     return total
 
@@ -61,4 +63,5 @@ def mismatch(reduction: Reduction, theta: Tensor, lam: Tensor) -> Tensor:
     """Return Yp g - y_ini, `(*batch, t_ini n_y)`."""
     a = times(reduction.A_theta, theta) - times(reduction.A_lam, lam)
     (fit,) = (fit for fit in reduction.rows.fits if fit.weight == "lambda_s")
+    assert fit.measured is not None
     return torch.sub(times(fit.rows, a), theta[..., fit.measured : fit.measured + fit.rows.shape[-2]])

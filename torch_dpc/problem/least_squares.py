@@ -1,6 +1,6 @@
 """The cost as weighted rows, and the part of g that lambda_g charges.
 
-    1/2 |E x - f|^2,   block rows  sqrt(R) Uf,  sqrt(Q) Yf,  sqrt(2 lambda_g) M,  sqrt(2 lambda_s) Yp,  ...
+1/2 |E x - f|^2,   block rows  sqrt(R) Uf,  sqrt(Q) Yf,  sqrt(2 lambda_g) M,  sqrt(2 lambda_s) Yp,  ...
 """
 
 from __future__ import annotations
@@ -26,16 +26,17 @@ def least_squares(rows: DataRows, weights: Weights) -> tuple[Tensor, Tensor]:
             blocks.append((root @ rows.C[..., term.rows, :], root, term.reference))
     for fit in rows.fits:
         root = (2 * getattr(weights, fit.weight)).sqrt()[..., None, None]
-        blocks.append((root * fit.rows, root * _eye(fit.rows.shape[-2], fit.rows), fit.measured))
+        target = None if fit.measured is None else root * _eye(fit.rows.shape[-2], fit.rows)
+        blocks.append((root * fit.rows, target, fit.measured))
     batch = broadcast_shapes(*(block.shape[:-2] for block, _, _ in blocks))
     E, f = [], []
     for block, matrix, start in blocks:
         E.append(without_rounding(block @ rows.Z, block).expand(*batch, -1, -1))
-        target = block.new_zeros(*batch, block.shape[-2], rows.n_theta)
+        of_theta = block.new_zeros(*batch, block.shape[-2], rows.n_theta)
         if matrix is not None and start is not None:
-            target[..., start : start + matrix.shape[-1]] = matrix
-        target[..., rows.Eq_theta] -= block @ rows.Eq_pinv
-        f.append(target)
+            of_theta[..., start : start + matrix.shape[-1]] = matrix
+        of_theta[..., rows.Eq_theta] -= block @ rows.Eq_pinv
+        f.append(of_theta)
     return torch.cat(E, dim=-2), torch.cat(f, dim=-2)
 
 

@@ -2,11 +2,15 @@
 
 With g = B a (:mod:`torch_dpc.data.row_space`) the problem reads
 
-    minimise over a   1/2 |v - v_ref|_W^2 + lambda_g |N a|^2 + sum over past rows of lambda |S a - s|^2
+    minimise over a   1/2 |v - v_ref|_W^2 + lambda_g |N a|^2 + sum over other rows of lambda |S a - s|^2
     subject to        Eq a = e,   v = C a in the product of the sets,
 
-with v = (u, y), and the changes of the input after them where the problem speaks of those. v_ref, s and e are entries
-of theta = (u_ini, y_ini, u_ref, y_ref). What each of the problem's terms adds is told here, and only here.
+with v = (u, y), and after them the changes of the input and the slack Yp g - y_ini where the problem speaks of those.
+v_ref, s and e are entries of theta = (u_ini, y_ini, u_ref, y_ref). What each of the problem's terms adds is told here,
+and only here.
+
+A slack of which the sets speak has coordinates of its own, the first ones of a, and is held at Yp g - y_ini by
+equalities: so v = C a, without a part that depends on theta.
 """
 
 from __future__ import annotations
@@ -22,6 +26,7 @@ from ..autodiff import carries_derivative
 from ..batching import times
 from ..data.hankel import HankelData
 from .data_derivative import in_row_space
+from .regularizers import charged_by, in_row_space_of_W, second_block
 from .terms import Terms
 
 #: How far u_ini may be from what the data can produce, relative to its norm, each channel in its own unit.
@@ -47,17 +52,17 @@ class Tracking:
 
 @dataclass(frozen=True, eq=False)
 class Fit:
-    """Past rows that are charged weight |S a - s|^2.
+    """Rows that are charged weight |S a - s|^2.
 
     Attributes:
         weight: the name of the weight.
         rows: S, `(k, r)`.
-        measured: where in theta s begins.
+        measured: where in theta s begins; None for zero.
     """
 
     weight: str
     rows: Tensor
-    measured: int
+    measured: int | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -144,59 +149,92 @@ class DataRows:
     def of(data: HankelData, device: torch.device, terms: Terms = Terms()) -> DataRows:  # noqa: B008
         """Return the rows of the data; a graph behind the data matrices reaches through."""
         space = data.row_space
-        if not space.clear and carries_derivative(data.matrices):
-            raise ValueError(
-                "the data carry a graph, but their rank is not clear, and derivatives hold at constant rank: the "
-                f"singular values around the decision are {space.last_kept:.1e} (kept) and {space.first_dropped:.1e} "
-                "(dropped), relative to the largest."
-            )
-        basis = space.basis.to(device)
-        stacked = data.stacked.to(device)
-        rows = in_row_space(stacked, basis) if carries_derivative(data.matrices) else stacked @ basis
+        theta_scale, charged = space.units.to(device), charged_by(terms.regularizer, space.rank, space.rank_W, device)
+        rows, fits = _in_coordinates(data, terms, device)
+        n_slack = len(data.Yp) if terms.mismatch else 0
+        rows, charged = (torch.nn.functional.pad(x, (n_slack, 0)) for x in (rows, charged))
         Up, Yp, Uf, Yf = rows.split([len(m) for m in data.matrices])
         u_ref = len(Up) + len(Yp)
         y_ref = u_ref + len(Uf)
-        n_theta = y_ref + len(Yf)
-        n_v = len(Uf) + len(Yf)
+        n_theta, n_v = y_ref + len(Yf), len(Uf) + len(Yf)
         tracking = [
             Tracking("R", slice(0, len(Uf)), u_ref, data.n_u),
             Tracking("Q", slice(len(Uf), n_v), y_ref, data.n_y),
         ]
-        fits = [Fit("lambda_s", Yp, len(Up))]
+        fits = [replace(fit, rows=torch.nn.functional.pad(fit.rows, (n_slack, 0))) for fit in fits]
+        fits.append(Fit("lambda_s", Yp, len(Up)))
         parts = [Uf, Yf]
         if terms.rates:
             # The input before the plan is (Up a)'s last step, which the equality rows hold at the measured one.
             parts.append(Uf - torch.cat([Up, Uf])[len(Up) - data.n_u : -data.n_u])
             tracking.append(Tracking("R_du", slice(n_v, n_v + len(Uf)), None, data.n_u))
-        equal, places = [], []
         if terms.slack:
             fits.append(Fit("lambda_u", Up[int(terms.affine) :], int(terms.affine)))
-            if terms.affine:  # 1'g = 1 has no slack
-                equal.append(Up[:1])
-                places.append(torch.arange(1))
-        else:
-            equal.append(Up)
-            places.append(torch.arange(len(Up)))
-        if terms.terminal_steps:
-            last = terms.terminal_steps * data.n_y
-            equal.append(Yf[-last:])
-            places.append(torch.arange(n_theta - last, n_theta))
-        Eq = torch.cat(equal) if equal else Up[:0]
-        Eq_theta = (torch.cat(places) if places else torch.arange(0)).to(device)
-        theta_scale = space.units.to(device)
-        scale = torch.cat([theta_scale[u_ref:], *[theta_scale[u_ref:y_ref]] * terms.rates])
+        scale = [theta_scale[u_ref:], *[theta_scale[u_ref:y_ref]] * terms.rates]
+        if terms.mismatch:
+            parts.append(torch.eye(n_slack, rows.shape[1], dtype=rows.dtype, device=device))
+            scale.append(theta_scale[len(Up) : u_ref])
+        Eq, Eq_theta = _equalities(rows, data, terms)
         eliminated = _eliminate(Eq.detach(), theta_scale[Eq_theta], data.rank_tolerance)
         return DataRows(
             *(Up, Yp, Uf, Yf, torch.cat(parts), Eq, Eq_theta, *eliminated),
-            charged=(torch.arange(space.rank, device=device) >= (0 if terms.identity else space.rank_W)).double(),
-            scale=scale,
+            charged=charged,
+            scale=torch.cat(scale),
             theta_scale=theta_scale,
-            is_identity=terms.identity,
+            is_identity=terms.regularizer == "identity",
             tracking=tuple(tracking),
             fits=tuple(fits),
             n_theta=n_theta,
             tolerance=data.rank_tolerance,
         )
+
+
+def _in_coordinates(data: HankelData, terms: Terms, device: torch.device) -> tuple[Tensor, list[Fit]]:
+    """Return [Up; Yp; Uf; Yf] B, `(rows, r)`, and what is charged of g besides lambda_g; a graph reaches through.
+
+    Raises:
+        ValueError: data with a graph whose rank is not clear.
+    """
+    space = data.row_space
+    has_graph = carries_derivative(data.matrices)
+    if not space.clear and has_graph:
+        raise ValueError(
+            "the data carry a graph, but their rank is not clear, and derivatives hold at constant rank: the "
+            f"singular values around the decision are {space.last_kept:.1e} (kept) and {space.first_dropped:.1e} "
+            "(dropped), relative to the largest."
+        )
+    basis, stacked = space.basis.to(device), data.stacked.to(device)
+    rows = in_row_space(stacked, basis) if has_graph else stacked @ basis
+    if terms.regularizer not in ("spc", "gamma"):
+        return rows, []
+    in_units = rows / space.units.to(device)[:, None]
+    W = in_units[: len(rows) - len(data.Yf)]
+    if terms.regularizer == "spc":
+        return in_row_space_of_W(rows, W, space.rank_W, data.rank_tolerance), []
+    cutoff = data.rank_tolerance * torch.linalg.matrix_norm(in_units.detach(), ord=2)
+    n_past = len(data.Up) + len(data.Yp)
+    return rows, [Fit("beta_2", second_block(W, n_past, space.rank_W, cutoff, data.rank_tolerance), None)]
+
+
+def _equalities(rows: Tensor, data: HankelData, terms: Terms) -> tuple[Tensor, Tensor]:
+    """Return the equality rows and the entries of theta that they equal.
+
+    Args:
+        rows: [Up; Yp; Uf; Yf] in the coordinates of the problem, `(rows, r)`.
+        data, terms: of the problem.
+    """
+    Up, Yp, _, Yf = rows.split([len(m) for m in data.matrices])
+    # 1'g = 1 has no slack
+    exact = int(terms.affine) if terms.slack else len(Up)
+    equal, places = [Up[:exact]], [torch.arange(exact)]
+    if terms.mismatch:
+        equal.append(Yp - torch.eye(*Yp.shape, dtype=rows.dtype, device=rows.device))
+        places.append(torch.arange(len(Up), len(Up) + len(Yp)))
+    if terms.terminal_steps:
+        last = terms.terminal_steps * data.n_y
+        equal.append(Yf[-last:])
+        places.append(torch.arange(len(rows) - last, len(rows)))
+    return torch.cat(equal), torch.cat(places).to(rows.device)
 
 
 #: The fields that depend on the data, and those of them that are vectors.

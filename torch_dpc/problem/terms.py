@@ -11,32 +11,37 @@ from torch import Tensor
 from ..data.hankel import HankelData
 from ..data.hankel_batch import HankelBatch
 
+#: What may be charged of g; see :mod:`torch_dpc.problem.regularizers`.
+REGULARIZERS = ("projection", "identity", "spc", "gamma")
+
 
 @dataclass(frozen=True)
 class Terms:
     """Which terms the problem has beyond the paper's.
 
     Attributes:
-        identity: lambda_g charges |g|^2 in place of |M g|^2.
+        regularizer: what is charged of g, one of :data:`REGULARIZERS`.
         slack: lambda_u |Up g - u_ini|^2 in place of Up g = u_ini.
         rates: the changes of the input, u_t - u_(t-1), are constrained or charged.
         terminal_steps: so many last outputs equal their reference.
         affine: 1'g = 1, one more row of Up before the others.
+        mismatch: Yp g - y_ini is constrained, or charged by a penalty that is not quadratic.
     """
 
-    identity: bool = False
+    regularizer: str = "projection"
     slack: bool = False
     rates: bool = False
     terminal_steps: int = 0
     affine: bool = False
+    mismatch: bool = False
 
 
 @dataclass(frozen=True)
 class Sizes:
-    """How many entries each part of theta = (u_ini, y_ini, u_ref, y_ref) and of v = (u, y, du) has, and how many steps.
+    """How many entries the parts of theta = (u_ini, y_ini, u_ref, y_ref) and of v = (u, y, du, slack) have, and steps.
 
     For affine systems a 1 stands before u_ini in theta, for 1'g = 1.
-    du, the changes of the input, has entries only where the problem speaks of them.
+    du, the changes of the input, and slack = Yp g - y_ini have entries only where the problem speaks of them.
     """
 
     u_ini: int
@@ -45,6 +50,7 @@ class Sizes:
     y: int
     horizon: int
     du: int = 0
+    slack: int = 0
 
     @staticmethod
     def of(data: HankelData | HankelBatch, terms: Terms = Terms()) -> Sizes:  # noqa: B008
@@ -58,12 +64,18 @@ class Sizes:
             future * n_y,
             future,
             future * n_u if terms.rates else 0,
+            past * n_y if terms.mismatch else 0,
         )
 
     @property
     def v(self) -> int:
         """The constrained rows, N."""
-        return self.u + self.y + self.du
+        return self.u + self.y + self.more
+
+    @property
+    def more(self) -> int:
+        """The rows of v after u and y."""
+        return self.du + self.slack
 
     @property
     def theta(self) -> tuple[int, int, int, int]:
@@ -84,5 +96,5 @@ class Sizes:
         batch = like.shape[:-1]
         u = like.new_zeros(*batch, self.u) if u is None else u.reshape((*batch, self.u))
         y = like.new_zeros(*batch, self.y) if y is None else y.reshape((*batch, self.y))
-        parts = [u, y, like.new_zeros(*batch, self.du)] if self.du else [u, y]
+        parts = [u, y, like.new_zeros(*batch, self.more)] if self.more else [u, y]
         return torch.cat(parts, dim=-1)

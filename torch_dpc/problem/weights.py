@@ -29,6 +29,7 @@ class Weights:
         lambda_g, lambda_s: regularisation of g and of the initial output, `(...)`.
         lambda_u: penalty on the mismatch of the initial input, `(...)`; None where that is exact.
         R_du: weight of the changes of the input, like R; None where they are not charged.
+        beta_2: regularisation of gamma_2, `(...)`; None where it is not charged.
     """
 
     Q: Tensor
@@ -37,9 +38,10 @@ class Weights:
     lambda_s: Tensor
     lambda_u: Tensor | None = None
     R_du: Tensor | None = None
+    beta_2: Tensor | None = None
 
     #: Dimensions of each weight that are its own; those before them are the batch.
-    TAILS = {"Q": 2, "R": 2, "lambda_g": 0, "lambda_s": 0, "lambda_u": 0, "R_du": 2}
+    TAILS = {"Q": 2, "R": 2, "lambda_g": 0, "lambda_s": 0, "lambda_u": 0, "R_du": 2, "beta_2": 0}
 
     @property
     def tensors(self) -> dict[str, Tensor]:

@@ -199,8 +199,12 @@ class SoftBox(ConvexSet):
 
     def jacobian_diagonal(self, x: Tensor, gamma: Any = 1.0) -> Tensor:
         pull = (x - self.box.project(x)).abs()
-        held = (pull > 0) & (pull <= gamma * as_tensor(self.weight).to(x))
+        lower, upper = self.box.bounds(x)
+        held = ((pull > 0) | (lower == upper)) & (pull <= gamma * as_tensor(self.weight).to(x))
         return (~held).to(x)
+
+    def is_point(self, x: Tensor) -> Tensor:
+        return self.box.is_point(x) & (self.box.project(x) == x)  # no small multiplier moves it from there
 
     def interval(self, places: Tensor, dtype: torch.dtype) -> tuple[tuple[Tensor, Tensor], Tensor]:
         """Return lower, upper and price of rows `(groups, size)`, `(*batch, groups, size)` each, without a graph."""

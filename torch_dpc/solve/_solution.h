@@ -11,14 +11,16 @@ typedef struct {
     int64_t *counts;              /* (2): held directions; bounds that v touches with a multiplier of zero */
 } Verdict;
 
-INLINE int is_point(const Sets *sets, int64_t row) {
-    return sets->lower[row] == sets->upper[row] && sets->price[row] == INFINITY;
+/* Whether an interval is a point that the multiplier `pull / gamma` does not move its row from. */
+INLINE int is_pinned(const Sets *sets, int64_t row, double pull, double most) {
+    return sets->lower[row] == sets->upper[row] && (sets->price[row] == INFINITY || pull <= most);
 }
 
-/* Whether an interval holds its row at x = v + gamma lam. */
+/* Whether an interval holds its row at x = v + gamma lam. One of zero width does so without a multiplier. */
 INLINE int is_row_held(const Sets *sets, int64_t row, double x, double gamma) {
     const double pull = fabs(x - clip(x, sets->lower[row], sets->upper[row]));
-    return is_point(sets, row) || (pull > 0.0 && pull <= gamma * sets->price[row]);
+    const double most = gamma * sets->price[row];
+    return is_pinned(sets, row, pull, most) || (pull > 0.0 && pull <= most);
 }
 
 /* List what is held at a solution, for derivatives: what is `weak` counts as free, a block if all of it is. `active`
@@ -86,7 +88,7 @@ INLINE void judge(
         verdict->v[i] = fabs(pull) <= most ? nearest : x - copysign(most, pull);
         const double v = verdict->v[i], reach = weakness * (1.0 + fabs(v));
         verdict->missed[i] = fabs(raw[i] - v) / (1.0 + fabs(v));
-        verdict->weak[i] = fabs(lam[i] * w->diagonal[i]) <= reach && !is_point(sets, i);
+        verdict->weak[i] = fabs(lam[i] * w->diagonal[i]) <= reach && !is_pinned(sets, i, fabs(pull), most);
         verdict->active[i] = !verdict->weak[i] && is_row_held(sets, i, x, c->gamma[i]);
         verdict->counts[0] += verdict->active[i];
         verdict->counts[1] += verdict->weak[i] && fabs(fmin(v - sets->lower[i], sets->upper[i] - v)) <= reach;

@@ -186,7 +186,7 @@ class Plan(torch.autograd.Function):
         u_t, y_t = ctx.solver.sizes.split(v_t)
         if at.is_box:
             return u_t, y_t, lam_t, None, None
-        return u_t, y_t, lam_t, None, None, v_t[..., v_t.shape[-1] - ctx.solver.sizes.du :], None
+        return u_t, y_t, lam_t, None, None, v_t[..., v_t.shape[-1] - ctx.solver.sizes.more :], None
 
     @staticmethod
     def vmap(info: Any, in_dims: tuple[Any, ...], *args: Any) -> tuple[tuple[Tensor, ...], tuple[int, ...]]:
@@ -239,7 +239,7 @@ def _as_rows(
 ) -> np.ndarray:
     """Return the cotangents of u, y and du as one of v, an array `(*batch, N)`; zero for None."""
     v_bar, start = np.zeros(shape), 0
-    for bar, size in ((u_bar, sizes.u), (y_bar, sizes.y), (du_bar, sizes.du)):
+    for bar, size in ((u_bar, sizes.u), (y_bar, sizes.y), (du_bar, sizes.more)):
         if bar is not None and size:
             v_bar[..., start : start + size] = bar.numpy().reshape(*shape[:-1], size)
         start += size

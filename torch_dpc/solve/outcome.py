@@ -59,7 +59,7 @@ class Solved(NamedTuple):
     """The solution of a batch of reduced problems.
 
     Attributes:
-        v: the constrained rows (u, y, du), within their sets, `(*batch, N)`; NaN without a solution.
+        v: the constrained rows (u, y, du, slack), within their sets, `(*batch, N)`; NaN without a solution.
         lam: their multipliers, `(*batch, N)`; zero without a solution.
         active: the rows that count as active in derivatives, `(*batch, N)`, boolean.
         info: status, iterations, residual, n_active, n_weakly_active of each sample, `(*batch, 5)`, float64.
@@ -114,7 +114,7 @@ class Planned(NamedTuple):
     Attributes:
         u, y: the plan, `(*batch, horizon, n)`; NaN without a solution.
         lam, active, info: as in :class:`Solved`.
-        du: the changes of the input, `(*batch, n_du)`, and
+        du: the rows of v after u and y, `(*batch, n)`, and
         weak: as in :class:`Solved`; both None for boxes, whose derivative needs neither.
     """
 
@@ -143,9 +143,9 @@ class Planned(NamedTuple):
 
 
 def joined(sizes: Sizes, u: Tensor | None, y: Tensor | None, du: Tensor | None, like: Tensor) -> Tensor:
-    """Return v `(*batch, N)` of its parts u, y `(*batch, horizon, n)` and du `(*batch, n_du)`; zero for None."""
+    """Return v `(*batch, N)` of its parts u, y `(*batch, horizon, n)` and du `(*batch, n)`; zero for None."""
     v = sizes.join(u, y, like)
-    return v if du is None or not sizes.du else torch.cat([v[..., : sizes.u + sizes.y], du], dim=-1)
+    return v if du is None or not sizes.more else torch.cat([v[..., : sizes.u + sizes.y], du], dim=-1)
 
 
 def check_finite(theta: Tensor, sizes: Sizes) -> None:

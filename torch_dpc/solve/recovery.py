@@ -125,11 +125,15 @@ class Recovery:
             v = torch.cat([x.detach().flatten(-2) for x in (self.planned.u, self.planned.y)], dim=-1)
             rounding = rounding_of(reduction.detach(), self.theta.detach(), a.detach(), v)
         a = a + rounding
-        basis = self.data.basis.to(a.device)
+        a = a[..., self.solver.sizes.slack :]
+        is_spc = a.shape[-1] < self.data.basis.shape[-1]
+        basis = self.data.basis.to(a.device)[..., : a.shape[-1]]
         if not carries_derivative((reduction.rows.C,)):
             return times(basis, a)
         # g = D^+ (D g), so that the data behind D are differentiated too; D in units, which g does not see.
         D = self.data.stacked.to(a.device) / reduction.rows.theta_scale[..., None]
+        if is_spc:
+            D = D[..., : D.shape[-2] - self.data.horizon * self.data.n_y, :]  # g is in the row space of W
         return times(torch.linalg.pinv(D, rtol=reduction.rows.tolerance), times(D @ basis, a))
 
     def _value(self) -> Tensor:
