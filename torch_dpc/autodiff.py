@@ -101,6 +101,11 @@ def carries_derivative(values: tuple[Any, ...]) -> bool:
     return any(forward_ad.unpack_dual(tensor).tangent is not None for tensor in tensors)
 
 
+def only_backward() -> bool:
+    """Return whether neither a function transform nor a forward derivative is under way."""
+    return not are_transforms_active() and getattr(forward_ad, "_current_level", 0) < 0
+
+
 def register_fields(cls: type[Any]) -> None:
     """Make a dataclass of tensors, or of None, a pytree: what `vmap` and transforms may return."""
     names = [field.name for field in dataclasses.fields(cls)]

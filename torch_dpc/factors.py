@@ -9,22 +9,25 @@ What carries a graph is made anew at every call, because a graph must not outliv
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from typing import Any
 
 import torch
 from torch import Tensor
 
-from .autodiff import carries_derivative, untransformed
+from .autodiff import carries_derivative, only_backward, untransformed
 from .checks import one_batch
 from .problem.problem import Problem, rows_of
 from .problem.reduction import Reduction, reduce
 from .problem.rows import DataRows
 from .problem.terms import Terms
 from .problem.weights import Weights, output_weight, penalty, weight_matrix
-from .settings import GivenWeights, Setup
+from .settings import GivenWeights, Setup, watch_of
+from .solve.direct import Direct
 from .solve.engines import Sets
 from .solve.solver import Solver
+from .watch import Watch
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,11 +45,58 @@ class Factored:
     solver: Solver
 
 
+@dataclass(frozen=True, eq=False)
+class Ready:
+    """The direct way of a layer, with what it was made from.
+
+    Attributes:
+        setup: the settings behind it.
+        watch: their parameters; None if they cannot be watched.
+        ways: the factored problem and single plans of it; None if they are not made yet, or there is no direct way.
+        is_made: whether somebody has tried to make them.
+    """
+
+    setup: Setup
+    watch: Watch | None
+    ways: tuple[Factored, Direct] | None = None
+    is_made: bool = False
+
+    @property
+    def is_current(self) -> bool:
+        """Whether the parameters are what they were."""
+        return self.watch is None or self.watch.is_unchanged()
+
+
 class Factors:
     """The memory of one layer."""
 
     def __init__(self) -> None:
         self._kept: dict[tuple[str, torch.device], tuple[tuple[Any, ...], Any]] = {}
+        self._ready: Ready | None = None
+
+    def direct(
+        self, setup: Setup, held: dict[str, Any], make: Callable[[], tuple[Factored, Sets]]
+    ) -> tuple[Factored, Direct] | None:
+        """Return the factored problem and single plans of it; None if there is no direct way for the present values.
+
+        Args:
+            setup: what follows from the settings.
+            held: the dictionary of the layer.
+            make: makes the factored problem and the sets on the CPU.
+        """
+        if not only_backward():
+            return None
+        kept = self._ready
+        if kept is None or kept.setup is not setup or not kept.is_current:
+            kept = self._ready = Ready(setup, watch_of(held, setup))
+        if kept.watch is None or kept.watch.requires_grad():
+            return None
+        if not kept.is_made:
+            factored, sets = make()
+            direct = Direct.of(factored.solver, sets, setup.windows)
+            kept = Ready(setup, kept.watch, None if direct is None else (factored, direct), is_made=True)
+            self._ready = kept
+        return kept.ways
 
     def __len__(self) -> int:
         """Return how many results are remembered."""

@@ -21,6 +21,7 @@ from .sets.bounds import Bounds
 from .settings import check_choice
 from .solution import DPCSolution, solution_of
 from .solve.derivative import plan
+from .solve.direct import Windows, addresses_of
 from .solve.engines import Sets
 from .solve.recovery import Recovery
 from .tracing import batches_of, described, flat_parameters, planned_by_operator
@@ -162,8 +163,29 @@ class DPCLayer(ConfiguredModule):
         """
         if torch.compiler.is_compiling():
             return self._traced(u_ini, y_ini, y_ref, u_ref, on_failure)
+        if (sol := self._planned_directly((u_ini, y_ini, u_ref, y_ref), on_failure)) is not None:
+            return sol
         theta, dtype = self.flatten(u_ini, y_ini, y_ref, u_ref)
         return self._plan(theta, self.present_sets(theta.device), dtype, on_failure)
+
+    def _planned_directly(self, windows: Windows, on_failure: str | None) -> DPCSolution | None:
+        """Plan one sample from its windows; None if the direct way does not serve it."""
+        setup = self._setup
+        addresses = addresses_of(windows, setup.windows)
+        ways = None if addresses is None else self._factors.direct(setup, self.__dict__, self._factored_and_sets)
+        if ways is None or addresses is None:
+            return None
+        factored, direct = ways
+        on_failure = self.on_failure if on_failure is None else check_choice("on_failure", on_failure)
+        theta, planned = direct.plan(windows, addresses, on_failure)
+        of = direct.solver, direct.sets, torch.float64, theta, planned
+        return solution_of(Recovery(setup.data, factored.reduction, *of))
+
+    def _factored_and_sets(self) -> tuple[Factored, Sets]:
+        cpu = torch.device("cpu")
+        factored, sets = self.factored(cpu), self.present_sets(cpu)
+        sets.batches(cpu)  # names a parameter that does not fit
+        return factored, sets
 
     def _traced(self, u_ini: Any, y_ini: Any, y_ref: Any, u_ref: Any, on_failure: str | None) -> DPCSolution:
         """Plan by an operator, while torch compiles or exports."""

@@ -17,6 +17,7 @@ from .data.hankel_batch import HankelBatch
 from .problem.terms import REGULARIZERS, Sizes, Terms
 from .sets import ConvexSet, Reals
 from .sets.feasible import FeasibleSet, identity_key
+from .watch import Watch
 
 #: The settings that take one of a few words.
 CHOICES = {
@@ -110,6 +111,12 @@ class Setup:
         """What the factors depend on besides the weights, to compare by `==`."""
         return self.solver, self.backward, self.data, self.terms, self.sets.structure_key
 
+    @cached_property
+    def windows(self) -> tuple[tuple[int, int], ...]:
+        """The shapes of u_ini, y_ini, u_ref and y_ref of one sample."""
+        data = self.data
+        return (data.t_ini, data.n_u), (data.t_ini, data.n_y), (data.horizon, data.n_u), (data.horizon, data.n_y)
+
     @staticmethod
     def of(settings: Settings) -> Setup:
         """Derive the setup.
@@ -143,6 +150,30 @@ class Setup:
         sets = FeasibleSet.of(named)
         sets.check_engine(settings.solver)
         return Setup(data, terms, Sizes.of(data, terms), sets, settings.backward, settings.solver)
+
+
+def watch_of(held: dict[str, Any], setup: Setup) -> Watch | None:
+    """Return a watch over the weights and the parameters of the sets; None if they cannot be watched.
+
+    Args:
+        held: the dictionary of the layer.
+        setup: what follows from its settings.
+    """
+    if not isinstance(setup.data, HankelData) or not setup.sets.is_of_the_package:
+        return None
+    places = []
+    for name in GivenWeights._fields:
+        holder = next((part for part in (held, held["_parameters"], held["_buffers"]) if name in part), None)
+        if holder is None:  # parametrised: made anew whenever it is asked for
+            return None
+        places.append((holder, name))
+    for owner, _ in setup.sets.parts:
+        holders = (owner.__dict__, owner._parameters, owner._buffers)
+        places += [(holder, name) for holder in holders for name in holder if name[0] != "_" and name != "training"]
+    try:
+        return Watch(places, setup.data.matrices)
+    except ValueError:
+        return None
 
 
 def _is_given(name: str, held: dict[str, Any]) -> bool:

@@ -99,11 +99,16 @@ class FeasibleSet(BlockStructure):
         return None if self.is_box else self
 
     @property
+    def is_of_the_package(self) -> bool:
+        """Whether no set is the user's own."""
+        return all(type(owner) in (Box, Reals, NonNegative, SoftBox, Ball, SecondOrderCone) for owner, _ in self.parts)
+
+    @property
     def sources(self) -> tuple[Any, ...] | None:
         """What the sets are made of, to compare by value; None if that is not known, of a set of the user's own."""
         if self.is_box:
             return tuple(bound for owner, _ in self.parts for bound in (owner.lower, owner.upper))
-        if not all(type(owner) in (Box, Reals, NonNegative, SoftBox, Ball, SecondOrderCone) for owner, _ in self.parts):
+        if not self.is_of_the_package:
             return None
         return tuple(argument for owner, _ in self.parts for argument in owner.config().values())
 

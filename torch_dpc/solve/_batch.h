@@ -142,7 +142,7 @@ INLINE void plan_sample(const Batch *b, Workspace *w, int64_t i) {
     b->succeeded[i] = 0;
     if (!reserve_curved(w)) return;
     if (!v0) {
-        for (int64_t j = 0; j < n; j++) w->v0[j] = dot(map->V + j * map->n_theta, theta, map->n_theta);
+        multiply(w->v0, map->V, theta, n, map->n_theta);
         v0 = w->v0;
     }
     const int solved = solve_one(b, w, i, v0, &iterations);

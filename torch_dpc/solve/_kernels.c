@@ -5,6 +5,7 @@
  *     solve_held    W (W'G W + diag curvature)^-1 W' rhs, W the directions that the sets hold at a solution
  *     plan          the whole of a small call: v0 = V theta, lam, v, and the residual
  *     plan_adjoint  and of its backward: V'(v_bar + S (lam_bar - G v_bar)), S as in solve_held
+ *     plan_one, adjoint_one   both for one sample, from the addresses of its windows
  *     judge_sets    what the sets say of multipliers: v, its distance from them, weak and active rows
  *     solve_active  s_A = G_AA^-1 rhs_A, zero elsewhere
  *     adjoint       v_bar + s,  s_A = G_AA^-1 (lam_bar - G v_bar)_A
@@ -23,8 +24,9 @@
  *     _batch.h      a sample of a batch
  *     _threads.h    all of them
  *     _arguments.h  Python's arguments
+ *     _windows.h    the windows of one sample
  */
-#include "_arguments.h"
+#include "_windows.h"
 
 /* --- entry points ------------------------------------------------------------------------------------------------- */
 
@@ -200,6 +202,11 @@ static PyMethodDef methods[] = {
      "plan(map, sets, theta, v0, v, lam, active, weak, info, convinces, settings, threads)"},
     {"plan_adjoint", FUNCTION(plan_adjoint), METH_FASTCALL,
      "plan_adjoint(map, sets, v, lam, active, weak, v_bar, lam_bar, v0_bar, theta_bar, trusted, settings, threads)"},
+    {"plan_one", FUNCTION(plan_one), METH_FASTCALL,
+     "plan_one(map, sets, windows, theta, v, lam, active, weak, info, settings, threads)"},
+    {"adjoint_one", FUNCTION(adjoint_one), METH_FASTCALL,
+     "adjoint_one(map, sets, v, lam, active, weak, windows, bars, theta_bar, settings, threads)"},
+    {"holds", FUNCTION(holds), METH_FASTCALL, "holds(address, numbers)"},
     {"solve_active", FUNCTION(solve_active), METH_FASTCALL,
      "solve_active(G, active, rhs, out, trusted, settings, threads)"},
     {"adjoint", FUNCTION(adjoint), METH_FASTCALL,

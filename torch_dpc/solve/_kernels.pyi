@@ -89,6 +89,35 @@ def plan_adjoint(
     threads: int,
     /,
 ) -> None: ...
+def plan_one(
+    map: tuple[Any, ...],
+    sets: tuple[ndarray | None, ...],
+    windows: tuple[int, ...],
+    theta: ndarray,
+    v: ndarray,
+    lam: ndarray,
+    active: ndarray,
+    weak: ndarray,
+    info: ndarray,
+    settings: Any,
+    threads: int,
+    /,
+) -> bool: ...
+def adjoint_one(
+    map: tuple[Any, ...],
+    sets: tuple[ndarray | None, ...],
+    v: ndarray,
+    lam: ndarray,
+    active: ndarray,
+    weak: ndarray,
+    windows: tuple[int, ...],
+    bars: ndarray,
+    theta_bar: ndarray,
+    settings: Any,
+    threads: int,
+    /,
+) -> bool: ...
+def holds(address: int, numbers: ndarray, /) -> bool: ...
 def solve_active(
     G: ndarray, active: ndarray, rhs: ndarray, out: ndarray, trusted: ndarray, settings: Any, threads: int, /
 ) -> None: ...

@@ -53,6 +53,29 @@ INLINE double dot(const double *restrict x, const double *restrict y, int64_t n)
     return total;
 }
 
+/* out_i = the product of row i of M, which is (m, n), with x; each as `dot` computes it, four side by side. */
+INLINE void multiply(double *restrict out, const double *restrict M, const double *restrict x, int64_t m, int64_t n) {
+    const int64_t whole = n / (2 * WIDTH) * (2 * WIDTH);
+    int64_t i = 0;
+    for (; i + 4 <= m; i += 4) {
+        const double *row = M + i * n;
+        vec a[4], b[4];
+        for (int t = 0; t < 4; t++) a[t] = b[t] = spread(0.0);
+        for (int64_t c = 0; c < whole; c += 2 * WIDTH) {
+            const vec x0 = load(x + c), x1 = load(x + c + WIDTH);
+            for (int t = 0; t < 4; t++) {
+                a[t] += load(row + t * n + c) * x0;
+                b[t] += load(row + t * n + c + WIDTH) * x1;
+            }
+        }
+        for (int t = 0; t < 4; t++) {
+            out[i + t] = sum(a[t] + b[t]);
+            for (int64_t c = whole; c < n; c++) out[i + t] += row[t * n + c] * x[c];
+        }
+    }
+    for (; i < m; i++) out[i] = dot(M + i * n, x, n);
+}
+
 /* y -= scale * x. */
 INLINE void subtract_scaled(double *restrict y, double scale, const double *restrict x, int64_t n) {
     const vec s = spread(scale);

@@ -132,32 +132,7 @@ class Plan(torch.autograd.Function):
         du_bar: Tensor | None = None,
         _weak: None = None,
     ) -> tuple[Tensor | None, ...]:
-        bars = [bar for bar in (u_bar, y_bar, lam_bar, du_bar) if bar is not None]
-        if not bars:
-            return (None,) * len(ctx.needs_input_grad)
-        need, solver = ctx.needs_input_grad, ctx.solver
-        is_final = not torch.is_grad_enabled() and all(map(is_plain, bars))  # nothing will be derived again
-        saved = saved_by(ctx)  # once: checkpoints of the graph refuse a second look
-        if is_final and solver.full is None and not (ctx.has_matrices or any(need[1:])):
-            theta_bar = _compiled_adjoint(ctx, saved, u_bar, y_bar, lam_bar, du_bar)
-            if theta_bar is not None:
-                return theta_bar, *(None,) * (len(need) - 1)
-        at = Linearization(ctx, saved)
-        v_bar = joined(solver.sizes, u_bar, y_bar, du_bar, at.lam)
-        if ctx.may_fail:  # samples without a solution add nothing, whatever came back for their NaN
-            solved = at.solved
-            v_bar = torch.where(solved, v_bar, 0.0)
-            lam_bar = None if lam_bar is None else torch.where(solved, lam_bar, 0.0)
-        if solver.full is not None:
-            theta_bar, pulled = at.full_adjoint(v_bar, lam_bar)
-            return theta_bar, *(None,) * (OF_SETS - 1), *pulled
-        v0_bar, pulled = at.adjoint(v_bar, lam_bar, is_final, need[OF_SETS:])
-        a_bar = times(at.C.mT, v0_bar)
-        theta_bar = times(at.A.mT, a_bar) if need[0] else None
-        A_bar = outer(a_bar, at.theta, at.A) if need[1] else None
-        C_bar = outer(v0_bar, times(at.A, at.theta), at.C) if need[2] else None
-        G_bar = outer(-v0_bar, at.lam, at.G) if need[3] else None
-        return theta_bar, A_bar, C_bar, G_bar, None, None, None, *pulled
+        return pulled_back(ctx, (u_bar, y_bar, lam_bar, du_bar), ctx.needs_input_grad)
 
     @staticmethod
     def jvp(
@@ -207,6 +182,43 @@ class Plan(torch.autograd.Function):
             tensors = [*lead_all((theta,), in_dims[:1], (1,), info.batch_size), *of_sets]
         outputs = Plan.apply(tensors[0], A, C, G, solver, sets, on_failure, *tensors[1:])
         return outputs, (0,) * len(outputs)
+
+
+def pulled_back(ctx: Any, bars: tuple[Tensor | None, ...], need: tuple[bool, ...]) -> tuple[Tensor | None, ...]:
+    """Return the cotangents of the arguments of `Plan`.
+
+    Args:
+        ctx: what `Plan.setup_context` leaves.
+        bars: cotangents of u, y, lam and du, each of which may be None.
+        need: which of the arguments need one.
+    """
+    given = [bar for bar in bars if bar is not None]
+    if not given:
+        return (None,) * len(need)
+    u_bar, y_bar, lam_bar, du_bar = bars
+    solver = ctx.solver
+    is_final = not torch.is_grad_enabled() and all(map(is_plain, given))  # nothing will be derived again
+    saved = saved_by(ctx)  # once: checkpoints of the graph refuse a second look
+    if is_final and solver.full is None and not (ctx.has_matrices or any(need[1:])):
+        theta_bar = _compiled_adjoint(ctx, saved, u_bar, y_bar, lam_bar, du_bar)
+        if theta_bar is not None:
+            return theta_bar, *(None,) * (len(need) - 1)
+    at = Linearization(ctx, saved)
+    v_bar = joined(solver.sizes, u_bar, y_bar, du_bar, at.lam)
+    if ctx.may_fail:  # samples without a solution add nothing, whatever came back for their NaN
+        solved = at.solved
+        v_bar = torch.where(solved, v_bar, 0.0)
+        lam_bar = None if lam_bar is None else torch.where(solved, lam_bar, 0.0)
+    if solver.full is not None:
+        theta_bar, pulled = at.full_adjoint(v_bar, lam_bar)
+        return theta_bar, *(None,) * (OF_SETS - 1), *pulled
+    v0_bar, pulled = at.adjoint(v_bar, lam_bar, is_final, need[OF_SETS:])
+    a_bar = times(at.C.mT, v0_bar)
+    theta_bar = times(at.A.mT, a_bar) if need[0] else None
+    A_bar = outer(a_bar, at.theta, at.A) if need[1] else None
+    C_bar = outer(v0_bar, times(at.A, at.theta), at.C) if need[2] else None
+    G_bar = outer(-v0_bar, at.lam, at.G) if need[3] else None
+    return theta_bar, A_bar, C_bar, G_bar, None, None, None, *pulled
 
 
 def _compiled_adjoint(

@@ -32,6 +32,11 @@ def has_kernels(tensor: Tensor) -> bool:
     return _kernels is not None and tensor.device.type == "cpu"
 
 
+def are_built() -> bool:
+    """Return whether there are kernels."""
+    return _kernels is not None
+
+
 def instructions() -> str:
     """Return which vector instructions the kernels use here, "none" if there are no kernels."""
     return "none" if _kernels is None else _kernels.instructions
