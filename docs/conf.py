@@ -10,6 +10,7 @@ os.environ.setdefault("OMP_NUM_THREADS", "1")
 
 project = "torch_dpc"
 author = "The torch_dpc authors"
+project_copyright = "the torch_dpc authors, MIT licence"
 extensions = [
     "myst_nb",
     "sphinx.ext.autodoc",

@@ -26,6 +26,7 @@ app = typer.Typer(
     help="Data-driven predictive control: is a recording good enough, and how vulnerable is a controller?",
     pretty_exceptions_enable=False,
     add_completion=False,
+    rich_markup_mode="markdown",  # joins the lines of a paragraph
 )
 console = Console()
 
@@ -65,6 +66,7 @@ def audit(
     outputs: Outputs,
     rho: Annotated[str, typer.Option(help="Sizes of the attack, relative to |y_ini|.")] = "0.01,0.05",
     y_ref: Annotated[str | None, typer.Option(help="Reference, a number an output; default their mean.")] = None,
+    u_ref: Annotated[str | None, typer.Option(help="Input reference, a number an input; default zero.")] = None,
     windows: Annotated[int, typer.Option(min=1, help="Windows of the recording, evenly spread.")] = 200,
     seed: Annotated[int, typer.Option(help="Of the random noise.")] = 0,
     picture: Picture = None,
@@ -75,13 +77,12 @@ def audit(
     what the layer's own data predict for the planned inputs.
     """
     u, y = read_csv(recording, _names(inputs), _names(outputs))
-    reference = y.mean(0) if y_ref is None else torch.tensor(_numbers("y_ref", y_ref), dtype=torch.float64)
-    if reference.shape != y.shape[1:]:
-        raise ValueError(f"`--y-ref` must have {y.shape[1]} numbers, got {len(reference)}.")
+    wanted = y.mean(0) if y_ref is None else _reference("y_ref", y_ref, y.shape[1])
+    wanted_u = torch.zeros(u.shape[1]) if u_ref is None else _reference("u_ref", u_ref, u.shape[1])
     rhos = _numbers("rho", rho)
     loaded = DPCLayer.load(layer)
-    result = audit_layer(loaded, u, y, rhos=rhos, windows=windows, y_ref=reference, seed=seed)
-    console.print(f"Reference {[round(value, 6) for value in reference.tolist()]}, {len(result.nominal)} windows")
+    result = audit_layer(loaded, u, y, rhos=rhos, windows=windows, y_ref=wanted, u_ref=wanted_u, seed=seed)
+    console.print(f"Reference {[round(value, 6) for value in wanted.tolist()]}, {len(result.nominal)} windows")
     _print_audit(result)
     if picture is not None:
         result.plot().savefig(picture, dpi=150)
@@ -92,7 +93,8 @@ def _print_check(verdict: Check, names: list[str]) -> None:
     data, space = verdict.data, verdict.data.row_space
     windows = f"{data.n_windows} windows of {data.t_ini} past and {data.horizon} future steps"
     table = Table(title=windows, show_header=False)
-    excitation = f"order {verdict.excitation} of {data.t_ini + data.horizon}"
+    reached, needed = verdict.excitation, data.t_ini + data.horizon
+    excitation = f"order {reached}, {needed} needed" if verdict.is_exciting else f"order {reached} of {needed}"
     table.add_row("excitation", excitation, "good" if verdict.is_exciting else "too little")
     has_gap = space.clear and data.rank < space.n_rows
     gap = "a clear gap: hardly any noise" if has_gap else "no gap: noise, or a nonlinear plant"
@@ -105,7 +107,9 @@ def _print_check(verdict: Check, names: list[str]) -> None:
         table.add_row(name, *(f"{100 * float(cell):.3g} %" for cell in cells))
     console.print(table)
     console.print("Errors are in percent of the standard deviation of the output; held: the last measured output.")
-    for sentence in verdict.advice or ["The recording is good enough to control with."]:
+    if verdict.is_exciting and verdict.is_useful:
+        console.print("The recording is good enough to control with.")
+    for sentence in verdict.advice:
         console.print(sentence)
 
 
@@ -117,15 +121,37 @@ def _print_audit(result: Audit) -> None:
         change = _median_and_high(damage.input_change)
         table.add_row(damage.attack, f"{100 * damage.rho:g} %", change, increase, unsolved)
     console.print(table)
+    console.print("Input change: of the planned inputs, the largest, in their units. Error: what the data predict.")
+    _print_comparison(result)
     console.print(f"Predicted error without an attack, rms of |y - y_ref|_Q: {_median_and_high(result.nominal)}.")
     if result.skipped:
         console.print(f"{result.skipped} windows were left out: the layer has no plan there, without an attack.")
+
+
+def _print_comparison(result: Audit) -> None:
+    """Print what the strongest attack of the largest size does beside random noise, in one sentence."""
+    largest = max(damage.rho for damage in result.damages)
+    of_size = [damage for damage in result.damages if damage.rho == largest and len(damage.increase)]
+    increases = {damage.attack: 100 * float(damage.increase.median()) for damage in of_size}
+    noise = increases.pop("random noise", None)
+    if noise is not None and increases:
+        console.print(
+            f"Measurement errors of {100 * largest:g} % raise the predicted error by {max(increases.values()):.3g} % "
+            f"if an attacker chooses them, and by {noise:.3g} % if they are random (medians)."
+        )
 
 
 def _median_and_high(values: torch.Tensor) -> str:
     if not len(values):
         return "-"
     return f"{float(values.median()):.3g} ({float(values.quantile(0.9)):.3g})"
+
+
+def _reference(option: str, text: str, channels: int) -> torch.Tensor:
+    values = torch.tensor(_numbers(option, text), dtype=torch.float64)
+    if len(values) != channels:
+        raise ValueError(f"`--{option.replace('_', '-')}` must have {channels} numbers, got {len(values)}.")
+    return values
 
 
 def _names(text: str) -> list[str]:

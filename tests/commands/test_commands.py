@@ -53,6 +53,8 @@ def test_a_good_recording_passes_and_leaves_a_picture(tmp_path):
     assert result.exit_code == 0, result.output
     assert "187 windows of 4 past and 10 future steps" in result.output
     assert "The recording is good enough to control with." in words(result)
+    order = dpc.excitation_order([recording()[0]])
+    assert order > 14 and f"order {order}, 14 needed" in words(result)
     with Image.open(picture) as image:
         assert image.size == (2100, 540)
         assert np.asarray(image.convert("L")).std() > 20
@@ -131,6 +133,7 @@ def test_an_audit_prints_every_attack_and_leaves_a_picture(saved, tmp_path):
     for name in ("random noise", "Algorithm 1", "projected gradient"):
         assert result.output.count(name) == 2
     assert "Reference [1.0, 1.0, 0.0, 0.0], 20 windows" in words(result)
+    assert "Measurement errors of 10 % raise the predicted error by" in words(result)
     with Image.open(picture) as image:
         assert np.asarray(image.convert("L")).std() > 10
 
@@ -159,6 +162,17 @@ def test_the_figures_of_an_audit_are_those_of_its_windows(saved):
     assert random.unsolved == 0
 
 
+def test_an_audit_takes_references_of_the_inputs(saved):
+    layer, (u, y) = saved[0], recording(seed=4)
+    y_ref, u_ref = torch.zeros(4, dtype=torch.float64), torch.full((2,), 0.4, dtype=torch.float64)
+    with_it, without = (audit(layer, u, y, rhos=[0.05], windows=5, y_ref=y_ref, u_ref=r, seed=0) for r in (u_ref, None))
+    assert not torch.allclose(with_it.nominal, without.nominal)
+    window = u[:3], y[:3]
+    plan = layer(*window, y_ref=y_ref, u_ref=u_ref).u
+    away = (attacks.Predictor(layer.data)(*window, plan) - y_ref).square().sum(-1)
+    torch.testing.assert_close(with_it.nominal[0], (SMALL["Q"] * away).mean().sqrt())
+
+
 def test_an_audit_of_another_plants_recording_is_refused(saved):
     u, y = recording()
     with pytest.raises(ValueError, match="the layer has 2 inputs and 4 outputs, the recording 2 and 3"):
@@ -181,6 +195,7 @@ def test_bad_input_ends_with_one_line_and_status_2(tmp_path):
         (("check", path, *NAMES, "--t-ini", 4, "--horizon", 10), "at least (t_ini + horizon) / 0.25 = 56 samples"),
         (("audit", path, path, *NAMES, "--rho", "a"), "`--rho` must be numbers separated by commas, got 'a'"),
         (("audit", path, path, *NAMES, "--y-ref", "1,2"), "`--y-ref` must have 4 numbers, got 2"),
+        (("audit", path, path, *NAMES, "--u-ref", "1"), "`--u-ref` must have 2 numbers, got 1"),
     ):
         done = as_process(*arguments)
         assert done.returncode == 2

@@ -63,7 +63,15 @@ class Audit:
 
 
 def audit(
-    layer: DPCLayer, u: Tensor, y: Tensor, *, rhos: Sequence[float], windows: int, y_ref: Tensor, seed: int
+    layer: DPCLayer,
+    u: Tensor,
+    y: Tensor,
+    *,
+    rhos: Sequence[float],
+    windows: int,
+    y_ref: Tensor,
+    seed: int,
+    u_ref: Tensor | None = None,
 ) -> Audit:
     """Attack the plans of a layer: random noise, Algorithm 1 and projected gradient, each within |p| <= rho |y_ini|.
 
@@ -76,6 +84,7 @@ def audit(
         windows: how many, evenly spread.
         y_ref: reference, `(n_y,)`.
         seed: of the random noise.
+        u_ref: input reference, `(n_u,)`; zero by default.
 
     Raises:
         ValueError: a recording of other channels than the layer's, or shorter than a window; no window has a plan.
@@ -89,14 +98,15 @@ def audit(
     if len(u) < data.t_ini:
         raise ValueError(f"the recording must have at least t_ini = {data.t_ini} samples, got {len(u)}.")
     layer.on_failure = "nan"
+    references = {"y_ref": y_ref, "u_ref": u_ref}
     places = torch.linspace(0, len(u) - data.t_ini, windows).round().long().unique()
     u_ini, y_ini = (x.unfold(0, data.t_ini, 1).mT[places] for x in (u, y))
-    solvable = layer(u_ini, y_ini, y_ref=y_ref).info.status == Status.SOLVED
+    solvable = layer(u_ini, y_ini, **references).info.status == Status.SOLVED
     if not bool(solvable.any()):
         raise ValueError("the layer has no plan from any window of the recording: do its units match?")
     u_ini, y_ini = u_ini[solvable], y_ini[solvable]
     predictor, weight = Predictor(data), weight_matrix("Q", layer.Q, data.n_y, data.horizon).detach()
-    nominal = layer(u_ini, y_ini, y_ref=y_ref).u
+    nominal = layer(u_ini, y_ini, **references).u
 
     def error(planned: Tensor) -> Tensor:
         away = (predictor(u_ini, y_ini, planned) - y_ref).flatten(-2)
@@ -111,8 +121,8 @@ def audit(
             ("Algorithm 1", attacks.LinearizedAttack(layer, cost, budget)),
             ("projected gradient", attacks.ProjectedGradientAttack(layer, cost, budget)),
         ):
-            p = attack(u_ini, y_ini, y_ref=y_ref, generator=torch.Generator().manual_seed(seed))
-            plan = layer(u_ini, y_ini + p, y_ref=y_ref)
+            p = attack(u_ini, y_ini, **references, generator=torch.Generator().manual_seed(seed))
+            plan = layer(u_ini, y_ini + p, **references)
             kept = plan.info.status == Status.SOLVED
             change = (plan.u - nominal).abs().amax((-2, -1))
             increase = error(plan.u) / before - 1
