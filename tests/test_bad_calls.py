@@ -4,7 +4,7 @@ import time
 
 import pytest
 
-from tests.bad_calls import attacks, control, data, layer, proofs, sets, systems
+from tests.bad_calls import attacks, control, data, defence, layer, proofs, sets, systems
 
 ROOMS = {
     "data": data,
@@ -12,6 +12,7 @@ ROOMS = {
     "sets": sets,
     "attacks": attacks,
     "control": control,
+    "defence": defence,
     "systems": systems,
     "proofs": proofs,
 }

@@ -182,6 +182,13 @@ def check_callable(name: str, value: Any, *, optional: bool = False) -> None:
         raise ValueError(f"`{name}` must be {kind}, got {type(value).__name__}{cure(name, value)}.")
 
 
+def check_has(name: str, value: Any, kind: str, *attributes: str) -> None:
+    """Raise ValueError unless a value has the attributes of what it is to be; `kind` says what that is."""
+    if isinstance(value, type) or not all(hasattr(value, attribute) for attribute in attributes):
+        came = f"the class {value.__name__}: make an object of it" if isinstance(value, type) else type(value).__name__
+        raise ValueError(f"`{name}` must be {kind}, got {came}.")
+
+
 def check_flag(name: str, value: Any) -> bool:
     """Return True or False.
 

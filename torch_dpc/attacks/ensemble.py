@@ -8,6 +8,7 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from ..checks import check_type
 from .base import Attack, AttackCall
 from .budgets import Budget
 from .objective import Objective
@@ -37,6 +38,9 @@ class Ensemble(Attack):
     """
 
     def __init__(self, attacks: Sequence[Attack], *, layer: Any = None, cost: Any = None):
+        check_type("attacks", attacks, (list, tuple))
+        for attack in attacks:
+            check_type("attacks", attack, Attack)
         if not attacks:
             raise ValueError("`attacks` must hold at least one attack, got none.")
         super().__init__(_AnyOf([attack.budget for attack in attacks]))

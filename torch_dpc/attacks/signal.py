@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..checks import check_count
+from ..checks import as_index, check_callable, check_count, check_number, check_type
 from ..control.controller import DPCController
 from ..errors import Status
 from ..reprs import Described
@@ -32,6 +32,11 @@ class RunError(Described):
     """
 
     def __init__(self, channels: list[int] | None = None):
+        if channels is not None:
+            check_type("channels", channels, (list, tuple, range))
+            rule = "`channels` must be integers, 0 or more, at least one"
+            if not channels or min(as_index(rule, channel) for channel in channels) < 0:
+                raise ValueError(f"{rule}, got {channels!r}.")
         self.channels = channels
 
     def __call__(self, u: Tensor, y: Tensor, u_ref: Tensor, y_ref: Tensor) -> Tensor:
@@ -100,8 +105,9 @@ class SignalAttack(Attack):
         super().__init__(budget)
         if not (hasattr(plant, "snapshot") and hasattr(plant, "restore")):
             raise ValueError("`plant` must have `snapshot()` and `restore(...)`, as plants in torch have.")
-        if not step_size > 0:
-            raise ValueError(f"`step_size` must be positive, got {step_size!r}.")
+        check_type("controller", controller, DPCController)
+        check_callable("cost", cost)
+        check_number("step_size", step_size, positive=True)
         self.plant, self.controller, self.cost, self.first_guess = plant, controller, cost, first_guess
         self.plans, self.steps, self.step_size = check_count("plans", plans), check_count("steps", steps), step_size
         self._reported: list[tuple[int, Tensor]] = []  # step and answer of the last plan; of this run alone

@@ -9,7 +9,15 @@ from typing import Any
 import torch
 from torch import Tensor
 
-from ..checks import check_batch, check_callable, check_count, check_generator, check_type, warn_of_two_readings
+from ..checks import (
+    check_batch,
+    check_callable,
+    check_count,
+    check_generator,
+    check_has,
+    check_type,
+    warn_of_two_readings,
+)
 from ..systems.plant import Plant, Port, per_input
 from .checkpoints import advance_with_checkpoints
 from .controller import DPCController
@@ -102,6 +110,8 @@ def simulate(
         check_callable("attack", attack, optional=True)
     else:
         attack = side_by_side(attack)
+    if detector is not None:
+        check_has("detector", detector, "a detector, such as a ConsistencyDetector or a Cusum", "monitor")
     if detector is not None and checkpoint_every is not None:
         raise ValueError("`detector` must be left out with `checkpoint_every`: a detector may have a memory.")
     loop = Loop(port, controller, y_refs, u_refs, attack, generator, detector)

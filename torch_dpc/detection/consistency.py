@@ -9,12 +9,12 @@ from typing import Any, NamedTuple
 import torch
 from torch import Tensor
 
-from ..checks import window
+from ..checks import as_index, check_type, window
 from ..data.hankel import HankelData
 from ..data.recordings import as_recordings, hankel
 from ..reprs import shown
 from ..shapes import broadcast_shapes
-from .cusum import Cusum
+from .cusum import Cusum, rate
 
 #: The residual of noise-free data is rounding. It is measured in this fraction of the largest singular value.
 RESIDUAL_FLOOR = 1e-8
@@ -69,6 +69,11 @@ class ConsistencyDetector:
     """
 
     def __init__(self, data: HankelData, *, rank: int | None = None):
+        check_type("data", data, HankelData)
+        rows = data.t_ini * (data.n_u + data.n_y)
+        rule = f"`rank` must be an integer from 1 to {rows}"
+        if rank is not None and not 1 <= as_index(rule, rank) <= rows:
+            raise ValueError(f"{rule}, got {rank!r}.")
         self.t_ini, self.n_u, self.n_y = data.t_ini, data.n_u, data.n_y
         with torch.no_grad():
             W = torch.cat([data.Up, data.Yp]).detach().double()
@@ -81,8 +86,6 @@ class ConsistencyDetector:
         singular[: len(S)] = S
         self.is_noisy = bool(singular[-1] > data.rank_tolerance * singular[0])
         self.rank = _rank(singular, self.t_ini * self.n_u, data.rank_tolerance) if rank is None else rank
-        if not 1 <= self.rank <= len(W):
-            raise ValueError(f"`rank` must be an integer from 1 to {len(W)}, got {rank!r}.")
         whitening = U / singular.clamp_min(RESIDUAL_FLOOR * singular[0]) / size[:, None]
         #: Maps of a flattened window to the energy's and the residual's coordinates.
         self.to_energy, self.to_residual = whitening[:, : self.rank].mT, whitening[:, self.rank :].mT
@@ -109,8 +112,7 @@ class ConsistencyDetector:
         Raises:
             ValueError: too few windows for the rate, or shapes that do not fit.
         """
-        if not 0 < false_alarms < 1:
-            raise ValueError(f"`false_alarms` must be between 0 and 1, got {false_alarms!r}.")
+        false_alarms = rate("false_alarms", false_alarms)
         u_ini, y_ini = self.windows(u, y)
         needed = math.ceil((len(u_ini) + 1) * (1 - false_alarms))
         if needed > len(u_ini):

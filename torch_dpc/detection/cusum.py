@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
+from typing import Any
 
 import torch
 from torch import Tensor
+
+from ..checks import check_callable, check_number
 
 #: Halvings of the interval that holds the threshold.
 HALVINGS = 60
@@ -22,7 +25,9 @@ class Cusum:
     """
 
     def __init__(self, score: Callable[[Tensor, Tensor], Tensor], drift: float, threshold: float):
-        self.score, self.drift, self.threshold = score, drift, threshold
+        check_callable("score", score)
+        self.score = score
+        self.drift, self.threshold = check_number("drift", drift), check_number("threshold", threshold)
 
     @staticmethod
     def calibrated(
@@ -36,14 +41,13 @@ class Cusum:
             drift: by default the mean of the clean scores and half their standard deviation.
             false_alarms: rate of steps.
         """
-        if not 0 < false_alarms < 1:
-            raise ValueError(f"`false_alarms` must be between 0 and 1, got {false_alarms!r}.")
-        drift = float(clean.mean() + 0.5 * clean.std()) if drift is None else drift
+        false_alarms = rate("false_alarms", false_alarms)
+        drift = float(clean.mean() + 0.5 * clean.std()) if drift is None else check_number("drift", drift)
         low, high = 0.0, float((clean - drift).clamp_min(0.0).sum()) + 1e-12
         for _ in range(HALVINGS):
             middle = (low + high) / 2
-            rate = float(run(clean, drift, middle).double().mean())
-            low, high = (low, middle) if rate <= false_alarms else (middle, high)
+            share = float(run(clean, drift, middle).double().mean())
+            low, high = (low, middle) if share <= false_alarms else (middle, high)
         return Cusum(score, drift, high)
 
     def monitor(self) -> Callable[[Tensor, Tensor], Tensor]:
@@ -62,6 +66,19 @@ class Cusum:
 
     def __repr__(self) -> str:
         return f"Cusum(drift={self.drift:.3g}, threshold={self.threshold:.3g})"
+
+
+def rate(name: str, value: Any) -> float:
+    """Return a rate between 0 and 1, both excluded.
+
+    Raises:
+        ValueError: anything else.
+    """
+    rule = f"`{name}` must be between 0 and 1"
+    number = check_number(name, value, kind="between 0 and 1")
+    if not 0 < number < 1:
+        raise ValueError(f"{rule}, got {value!r}.")
+    return number
 
 
 def run(scores: Tensor, drift: float, threshold: float) -> Tensor:

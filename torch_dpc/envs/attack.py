@@ -15,7 +15,7 @@ from torch import Tensor
 
 from ..attacks import costs
 from ..attacks.budgets import Budget
-from ..checks import check_count
+from ..checks import check_count, check_type
 from ..control.controller import DPCController
 from ..control.references import reference_trajectory
 from ..reprs import shown
@@ -85,6 +85,9 @@ class AttackEnv(gymnasium.Env[Array, Array]):
         start: Callable[[np.random.Generator], Mapping[str, Any]] | None = None,
         u_warmup: Any = 0.0,
     ) -> None:
+        check_type("controller", controller, DPCController)
+        check_type("budget", budget, Budget)
+        costs.check_cost(cost)
         data, port = controller.layer.data, Port(plant)
         if (port.n_u, port.n_y) != (data.n_u, data.n_y):
             raise ValueError(

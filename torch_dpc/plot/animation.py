@@ -12,6 +12,7 @@ import numpy as np
 from matplotlib.animation import FuncAnimation, PillowWriter, writers
 from matplotlib.figure import Figure
 
+from ..checks import check_has
 from .figure import BLUE, GREY, as_array, names_of, panels, styled
 from .runs import log as draw_log
 
@@ -47,6 +48,7 @@ def animate(
         ValueError: outputs that do not exist.
         RuntimeError: a film of this kind needs ffmpeg, which is missing.
     """
+    check_has("log", log, "a ClosedLoopLog", "t", "u", "y", "y_ref", "p")
     path, steps = Path(path), len(log.t)
     if path.suffix != ".gif" and not writers.is_available("ffmpeg"):
         raise RuntimeError(f"a film of kind {path.suffix!r} needs ffmpeg, which was not found; use .gif.")

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.figure import Figure
 from matplotlib.ticker import FuncFormatter
 
+from ..checks import check_has
 from .figure import BAND, BLUE, CYCLE, GREY, VERMILION, as_array, panels, styled
 
 
@@ -45,6 +46,9 @@ def damage(
         >>> [line.get_label() for line in figure.axes[0].lines]
         ['random noise']
     """
+    rule = "`curves` must map names to {size: values}"
+    if not isinstance(curves, Mapping) or not all(isinstance(curve, Mapping) for curve in curves.values()):
+        raise ValueError(f"{rule}, got {curves!r}.")
     if not curves or not all(curves.values()):
         raise ValueError("`curves` must map at least one name to {size: values}, got an empty mapping.")
     figure, (one,) = panels(axes, 1, 1, 1, (5.2, 3.6))
@@ -85,6 +89,7 @@ def perturbation(log: Any, axes: Any = None) -> Figure:
     Raises:
         ValueError: a batch of runs.
     """
+    check_has("log", log, "a ClosedLoopLog", "t", "u", "y", "y_ref", "p")
     t, p = as_array(log.t), as_array(log.p)
     if p.ndim != 3:
         raise ValueError(f"`log` must be one run, got a batch of shape {p.shape[:-3]}; draw log[i].")
@@ -123,6 +128,7 @@ def worst_case(result: Any, axes: Any = None) -> Figure:
     Raises:
         ValueError: a batch of windows.
     """
+    check_has("result", result, "a WorstCase", "p", "value", "bound")
     p, value, bound = (as_array(x) for x in (result.p, result.value, result.bound))
     if p.ndim != 2:
         raise ValueError(f"`result` must be that of one window, got p of shape {p.shape}.")

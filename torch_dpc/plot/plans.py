@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from matplotlib.figure import Figure
 
+from ..checks import check_has
 from .figure import BLUE, GREEN, GREY, Array, as_array, draw_runs, legend_of, names_of, panels, styled
 
 
@@ -42,6 +43,7 @@ def plan(
     Raises:
         ValueError: names or axes that do not fit.
     """
+    check_has("plan", plan, "a DPCSolution", "u", "y")
     u, y = (_flat(x) for x in (plan.u, plan.y))
     n_u, n_y, horizon = u.shape[-1], y.shape[-1], y.shape[-2]
     names = names_of(y_names, n_y, "y") + names_of(u_names, n_u, "u")

@@ -8,6 +8,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ..checks import check_has
 from .figure import BLUE, GREY, VERMILION, Array, as_array, panels, styled
 
 #: Columns of the picture: more windows are thinned out evenly.
@@ -34,6 +35,7 @@ def data(data: Any, axes: Any = None) -> Figure:
     Raises:
         ValueError: another number of axes.
     """
+    check_has("data", data, "a HankelData", "Up", "Yp", "Uf", "Yf", "row_space")
     figure, (picture, values, inputs) = panels(axes, 3, 1, 3, (11.0, 3.6), width_ratios=(1.5, 1, 1))
     blocks = [as_array(m) for m in (data.Up, data.Yp, data.Uf, data.Yf)]
     units = as_array(data.row_space.units)

@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from ..checks import check_has
 from .figure import (
     BAND_LABEL,
     BLUE,
@@ -56,6 +57,7 @@ def log(
     Raises:
         ValueError: names or axes that do not fit.
     """
+    check_has("log", log, "a ClosedLoopLog", "t", "u", "y", "y_ref", "p")
     t, u, y, y_ref, p = (as_array(x) for x in (log.t, log.u, log.y, log.y_ref, log.p))
     n_y, n_u = y.shape[-1], u.shape[-1]
     attacked = bool(np.any(p))

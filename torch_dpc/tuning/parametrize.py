@@ -29,7 +29,7 @@ class Positive(nn.Module):
             ValueError: a weight that is not positive.
         """
         if not bool((weight > 0).all()):
-            raise ValueError(f"a weight under `Positive` must be positive, got {weight!r}.")
+            raise ValueError(f"`weight` under Positive must be positive, got {weight!r}.")
         return weight.log()
 
 
@@ -53,9 +53,11 @@ class Semidefinite(nn.Module):
         Raises:
             ValueError: a weight that is not symmetric positive semidefinite.
         """
+        if weight.ndim < 2 or weight.shape[-1] != weight.shape[-2]:
+            raise ValueError(f"`weight` under Semidefinite must have shape (*batch, n, n), got {tuple(weight.shape)}.")
         values, vectors = torch.linalg.eigh(weight)
         largest = values.abs().amax(-1, keepdim=True).clamp_min(torch.finfo(weight.dtype).tiny)
         rounding = weight.shape[-1] * torch.finfo(weight.dtype).eps * largest
         if not torch.allclose(weight, weight.mT) or not bool((values >= -rounding).all()):
-            raise ValueError("a weight under `Semidefinite` must be symmetric positive semidefinite.")
+            raise ValueError("`weight` under Semidefinite must be symmetric positive semidefinite.")
         return vectors * values.clamp_min(0.0).sqrt()[..., None, :]

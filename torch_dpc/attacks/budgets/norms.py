@@ -8,7 +8,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from ...checks import check_flag
+from ...checks import check_flag, check_type
 from .base import Budget, NormBound, direction, euclidean, nonnegative, norm_bound, ratio, standard_normal
 
 
@@ -219,6 +219,7 @@ class PerSampleBudget(Budget):
     """
 
     def __init__(self, budget: Budget):
+        check_type("budget", budget, Budget)
         self.budget = budget
         self.convex = budget.convex
 

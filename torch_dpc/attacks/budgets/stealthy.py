@@ -8,6 +8,7 @@ from typing import Any, Protocol
 import torch
 from torch import Tensor
 
+from ...checks import check_has
 from .base import Budget, NormBound, direction, euclidean, standard_normal
 from .norms import BallBudget, SparseBallBudget
 
@@ -53,6 +54,7 @@ class StealthyBudget(Budget):
     def __init__(self, budget: Budget, detector: QuadraticDetector):
         if not isinstance(budget, BallBudget) or isinstance(budget, SparseBallBudget):
             raise ValueError(f"`budget` must be a BallBudget or RelativeBallBudget, got {type(budget).__name__}.")
+        check_has("detector", detector, "a calibrated ConsistencyDetector", "maps")
         self.budget, self.detector = budget, detector
         self.E_u, self.E_y = detector.maps()
         # E_y = left size axes'; for noise-free data sizes differ by 1e8, and E_y'E_y would lose the small ones
