@@ -46,7 +46,7 @@ FULL = {
         "imitate": 1500,
         "lower": 200,
         "warm": 400,
-        "loop": 150,
+        "loop": 60,
         "batch": 256,
         "loops": 48,
         "runs": 48,
@@ -207,7 +207,7 @@ def compare(trainings: Sequence[Training], modes: Sequence[str], seeds: int, wor
 
 
 def main(argv: list[str] | None = None) -> None:
-    parser = arguments(__doc__, seeds=8)
+    parser = arguments(__doc__, seeds=6)
     parser.add_argument("--plant", choices=sorted(judge.PLANTS), default="masses")
     parser.add_argument("--mode", choices=[*MODES, "all"], default="all")
     parser.add_argument("--seed", type=int, nargs="+", help="of weights, recorded runs and batches (default 0 1 2)")

@@ -25,11 +25,17 @@ MUTANTS = [
     M(
         "references of u and y swapped ends",
         ROWS,
-        'Tracking("Q", slice(len(Uf), n_v), y_ref)',
-        'Tracking("Q", slice(len(Uf), n_v), None)',
+        'Tracking("Q", slice(len(Uf), n_v), y_ref, data.n_y)',
+        'Tracking("Q", slice(len(Uf), n_v), None, data.n_y)',
         OPT,
     ),
-    M("u_ref ignored", ROWS, 'Tracking("R", slice(0, len(Uf)), u_ref)', 'Tracking("R", slice(0, len(Uf)), None)', OPT),
+    M(
+        "u_ref ignored",
+        ROWS,
+        'Tracking("R", slice(0, len(Uf)), u_ref, data.n_u)',
+        'Tracking("R", slice(0, len(Uf)), None, data.n_u)',
+        OPT,
+    ),
     M(
         "M charges one direction too few",
         REGULARIZERS,

@@ -61,8 +61,8 @@ MUTANTS = [
     M(
         "infeasible without a certificate",
         SOLVER,
-        "status = torch.where(proven | unreachable,",
-        "status = torch.where(failed | unreachable,",
+        "solved.empty(failed & (proven | unreachable), Status.INFEASIBLE)",
+        "solved.empty(failed, Status.INFEASIBLE)",
         GUARDS,
     ),
     M(
@@ -81,8 +81,8 @@ MUTANTS = [
     ),
     M(
         "failed samples keep numbers",
-        SOLVER,
-        "solved.v[failed] = torch.nan",
+        OUTCOME,
+        "self.v[samples] = torch.nan",
         "pass",
         FAILURES + " -k name_the_batch or changes_nothing",
     ),
