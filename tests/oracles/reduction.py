@@ -14,6 +14,7 @@ from .problem import Problem, Sample, root
 RANK = 1e-10  # singular values below this share of the largest are rounding of the recording
 AMBIGUOUS = (1e-13, 1e-8)  # between these a rank is a matter of opinion
 KERNEL = 1e-15  # pivots of E below this share of the largest are zero (it is long double throughout)
+STILL = 1e-12  # an entry of v that a direction without cost moves by less than this share of its row stays
 DEPENDENT = 1e-9  # rows of Up g = u_ini below this share follow from the others
 
 
@@ -34,9 +35,11 @@ def rows_of(p: Problem) -> Rows:
     parts = [long(m) / np.tile(s, len(m) // len(s))[:, None]
              for m, s in ((p.Up, p.scale_u), (p.Yp, p.scale_y), (p.Uf, p.scale_u), (p.Yf, p.scale_y))]  # fmt: skip
     W = np.concatenate(parts[:3])
-    _, size, vectors = np.linalg.svd(np.asarray(W, float), full_matrices=False)
+    left, size, _ = np.linalg.svd(np.asarray(W, float), full_matrices=False)
     largest = size[0] if size.size and size[0] > 0 else 1.0
-    B1 = orthonormal(vectors[size > RANK * largest].T)
+    kept = size > RANK * largest
+    # Sums of rows in long double lie in their span; singular vectors are off by rounding over their singular value.
+    B1 = qr(W.T @ (left[:, kept] / size[kept]))[0][:, : kept.sum()]
     rest = parts[3] - (parts[3] @ B1) @ B1.T
     rest = rest - (rest @ B1) @ B1.T
     largest = max(largest, np.linalg.norm(np.asarray(parts[3], float), 2))
@@ -121,9 +124,13 @@ def reduce(p: Problem, rows: Rows, s: Sample) -> Reduced:
     X[order[k:], k:] = np.eye(n - k, dtype=LONG)
     A = Z @ X
     C = np.concatenate([rows.Uf, rows.Yf, change @ rows.Uf])
+    CA = C @ A
+    # What a direction without cost moves by rounding alone it does not move: 1e17 times that would be a plan.
+    still = np.abs(CA[:, k:]) <= STILL * np.sqrt((C**2).sum(1))[:, None] * np.sqrt((A[:, k:] ** 2).sum(0))
+    CA[:, k:][still] = 0
     c = C @ a0 + np.concatenate([np.zeros(C.shape[0] - len(first), LONG), -first])
     rest = LONG(0.5) * (rotated[k:] ** 2).sum()
-    return Reduced(rotated[:k], rest, C @ A, c, A, a0, contradiction, rows.ambiguous, C @ Z)
+    return Reduced(rotated[:k], rest, CA, c, A, a0, contradiction, rows.ambiguous, C @ Z)
 
 
 def _differences(p: Problem, s: Sample, su: Array) -> tuple[Array, Array]:

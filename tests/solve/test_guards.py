@@ -9,7 +9,7 @@ import torch
 import torch_dpc as dpc
 from helpers import Y_REF, small_layer, windows
 from torch_dpc.sets.bounds import Bounds
-from torch_dpc.solve import active_set, certificate, daqp, optimality, outcome, weakness
+from torch_dpc.solve import active_set, certificate, daqp, last_resort, optimality, outcome, weakness
 from torch_dpc.solve.compiled import CompiledPlanner
 from torch_dpc.solve.engines import Engines
 from torch_dpc.solve.outcome import Found
@@ -64,8 +64,19 @@ def test_multipliers_that_are_a_little_off_are_polished_or_refused(problem, monk
     layer, inputs, right = problem
     engine_that_spoils(monkeypatch, lambda lam: lam * (1 + off))
     monkeypatch.setattr(SecondLook, "polished", unpolished)
+    monkeypatch.setattr(last_resort, "settled", lambda *_: None)
     plan = layer(*inputs, y_ref=Y_REF)
     assert not solved_and_wrong(plan, right).any() and (plan.info.status == dpc.Status.FAILED).all()
+
+
+@pytest.mark.parametrize("factor, shift", [(0.0, 0.0), (-1.0, 0.0), (1.0, 1e3), (torch.nan, 0.0)])
+def test_the_last_resort_solves_what_every_engine_spoils(problem, monkeypatch, factor, shift):
+    layer, inputs, right = problem
+    engine_that_spoils(monkeypatch, lambda lam: lam * factor + shift)
+    monkeypatch.setattr(SecondLook, "polished", unpolished)
+    plan = layer(*inputs, y_ref=Y_REF)
+    assert (plan.info.status == dpc.Status.SOLVED).all() and not solved_and_wrong(plan, right).any()
+    assert torch.allclose(plan.lam, right.lam, rtol=1e-7, atol=1e-9)
 
 
 def test_a_second_look_repairs_what_is_a_little_off(problem, monkeypatch):

@@ -12,10 +12,14 @@ import logging
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 LOGGER = logging.getLogger(__name__)
+#: Rows of W whose singular values spread by more than this need extended precision for the basis of their space.
+THIN = 1e-4
 
 
 @dataclass(frozen=True, eq=False)
@@ -77,6 +81,8 @@ class RowSpace:
         # Orthogonal once more: the remainder of Yf is small on low-noise data and would keep a trace of W.
         in_rest = torch.linalg.qr(in_rest - in_W @ (in_W.T @ in_rest)).Q
         basis = columns @ torch.cat([in_W, in_rest], dim=1)
+        if len(kept_W) and bool(kept_W[-1] < THIN * kept_W[0]):
+            basis = _turned_onto(stacked[:n_W], basis, in_W.shape[1])
         kept = torch.cat([kept_W, kept_rest]) / largest
         dropped = torch.cat([dropped_W, dropped_rest]) / largest
         space = RowSpace(
@@ -117,6 +123,31 @@ def _channel_units(rows: Tensor, channels: int, n_windows: int) -> Tensor:
     mean_square = scaled.square().sum(dim=(0, 2)) / (scaled.shape[0] * n_windows)
     size = torch.where(largest > 0, largest * mean_square.sqrt(), 1.0)
     return torch.exp2(size.log2().round())
+
+
+def _turned_onto(W: Tensor, basis: Tensor, rank: int) -> Tensor:
+    """Return the basis with its first `rank` columns on the row space of W to full precision, the others across it.
+
+    A singular vector is off by rounding relative to its singular value, and |M g|^2 charges what lies beside the rows
+    of W. Sums of rows of W in extended precision lie beside nothing.
+    """
+    long = W.cpu().numpy().astype(np.longdouble)
+    first, others = basis[:, :rank].cpu().numpy(), basis[:, rank:].cpu().numpy().astype(np.longdouble)
+    image = (W.cpu().numpy() @ first).astype(float)  # U S of the singular value decomposition
+    size = np.linalg.norm(image, axis=0)
+    turned = _orthonormal(long.T @ (image / size**2))
+    others = others - turned @ (turned.T @ others)
+    return torch.from_numpy(np.concatenate([turned, _orthonormal(others)], axis=1).astype(float)).to(basis.device)
+
+
+def _orthonormal(columns: NDArray[np.longdouble]) -> NDArray[np.longdouble]:
+    """Return orthonormal columns that span those given, by Gram-Schmidt, each column done twice."""
+    Q = columns.copy()
+    for j in range(Q.shape[1]):
+        for _ in range(2):
+            Q[:, j] -= Q[:, :j] @ (Q[:, :j].T @ Q[:, j])
+            Q[:, j] /= np.sqrt(Q[:, j] @ Q[:, j])
+    return Q
 
 
 def _right_range(matrix: Tensor, cutoff: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -59,6 +59,27 @@ def terms_of_cost(reduction: Reduction, theta: Tensor, a: Tensor) -> Tensor:
     return total
 
 
+def slope_of_cost(reduction: Reduction, theta: Tensor, a: Tensor) -> Tensor:
+    """Return the gradient of :func:`terms_of_cost` in a, `(*batch, r)`."""
+    rows, weights = reduction.rows, reduction.weights
+    total = 2 * weights.lambda_g[..., None] * times(gram_of_charged(rows), a)
+    for term in rows.tracking:
+        weight = getattr(weights, term.weight)
+        if weight is None:
+            continue
+        block = rows.C[..., term.rows, :]
+        error = times(block, a)
+        if term.reference is not None:
+            error = error - theta[..., term.reference : term.reference + error.shape[-1]]
+        total = total + times(block.mT, times(weight, error))
+    for fit in rows.fits:
+        error = times(fit.rows, a)
+        if fit.measured is not None:
+            error = error - theta[..., fit.measured : fit.measured + fit.rows.shape[-2]]
+        total = total + 2 * getattr(weights, fit.weight)[..., None] * times(fit.rows.mT, error)
+    return total
+
+
 def mismatch(reduction: Reduction, theta: Tensor, lam: Tensor) -> Tensor:
     """Return Yp g - y_ini, `(*batch, t_ini n_y)`."""
     a = times(reduction.A_theta, theta) - times(reduction.A_lam, lam)

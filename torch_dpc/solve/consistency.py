@@ -10,7 +10,7 @@ import torch
 from torch import Tensor
 
 from ..batching import times
-from ..problem.cost import terms_of_cost
+from ..problem.cost import slope_of_cost, terms_of_cost
 from ..problem.reduction import Reduction
 from .outcome import ACCEPTANCE
 
@@ -18,6 +18,8 @@ from .outcome import ACCEPTANCE
 NO_DIRECTION = 1e-13
 #: A miss of a reference that costs nothing worth the name, relative to the unit of its channel.
 NEGLIGIBLE = 1e-8
+#: Plans go no further along directions without cost, relative to 1 + |a|.
+REACH = 1e3
 
 
 def rounding_of(reduction: Reduction, theta: Tensor, a: Tensor, v: Tensor) -> Tensor:
@@ -49,33 +51,40 @@ def rounding_of(reduction: Reduction, theta: Tensor, a: Tensor, v: Tensor) -> Te
     return change + torch.where(is_off, times(back, _solved(Ct * per[..., None], missed)), 0.0)
 
 
-def inconsistency(reduction: Reduction, theta: Tensor, lam: Tensor, v: Tensor) -> Tensor:
-    """Return by how much the best g misses the plan v `(*batch, N)`, relative to each row's unit, `(*batch,)`."""
+def coefficients(reduction: Reduction, theta: Tensor, lam: Tensor, v: Tensor) -> Tensor:
+    """Return the coefficients that reproduce the plan v `(*batch, N)`, du left out or not, `(*batch, r)`."""
     a = times(reduction.A_theta, theta) - times(reduction.A_lam, lam)
-    a = a + rounding_of(reduction, theta, a, v)
-    missed = (v - times(reduction.rows.C, a)) / reduction.scale
-    return (missed.abs() / (1 + (v / reduction.scale).abs())).amax(-1)
+    return a + rounding_of(reduction, theta, a, v)
 
 
-def excess_cost(reduction: Reduction, theta: Tensor, lam: Tensor, v: Tensor) -> Tensor:
-    """Return a bound on what the best g of a plan costs beyond the optimum, relative to its cost, `(*batch,)`.
+def inconsistency(reduction: Reduction, a: Tensor, v: Tensor) -> Tensor:
+    """Return by how much coefficients miss the plan v `(*batch, N)`, relative to each row's unit, `(*batch,)`."""
+    n = v.shape[-1]
+    per = 1 / reduction.scale[..., :n]
+    missed = (v - times(reduction.rows.C[..., :n, :], a)) * per
+    return (missed.abs() / (1 + (v * per).abs())).amax(-1)
+
+
+def excess_cost(reduction: Reduction, theta: Tensor, a: Tensor, lam: Tensor, v: Tensor) -> Tensor:
+    """Return a bound on what coefficients of a plan v cost beyond the optimum, relative to their cost, `(*batch,)`.
 
     The cost is quadratic with the Hessian T'T on the kernel of Eq, so a slope r of the Lagrangian is worth at most
-    1/2 |T^-T r|^2. Along the kernel of the cost T holds the small charge alone: a slope that is left there counts most.
+    1/2 |T^-T r|^2. Along the kernel of the cost no curvature ends a slope: it is worth as much as a plan may go there.
     A cost below that of missing every target by :data:`NEGLIGIBLE` of its unit counts as that.
     """
-    rows, n = reduction.rows, v.shape[-1]
-    a = times(reduction.A_theta, theta) - times(reduction.A_lam, lam)
-    a = (a + rounding_of(reduction, theta, a, v)).detach().requires_grad_()
-    with torch.enable_grad():
-        cost = terms_of_cost(reduction, theta, a)
-        (slope,) = torch.autograd.grad(cost.sum(), a)
-    slope = times(reduction.Z.mT, slope + times(rows.C[..., :n, :].mT, lam[..., :n]))
-    worth = torch.linalg.solve_triangular(reduction.T.mT, slope[..., None], upper=False)[..., 0]
-    return worth.square().sum(-1) / 2 / torch.maximum(cost.detach().abs(), _negligible_cost(reduction))
+    left = slope_of_cost(reduction, theta, a) + times(reduction.rows.C.mT, lam)
+    slope = times(reduction.Z.mT, left)
+    worth = torch.linalg.solve_triangular(reduction.T.mT, slope[..., None], upper=False)[..., 0].square().sum(-1) / 2
+    missed = torch.nan_to_num(v - times(reduction.rows.C[..., : v.shape[-1], :], a))
+    worth = worth + (missed * lam[..., : v.shape[-1]]).abs().sum(-1)
+    if reduction.is_selection:
+        far = REACH * (1 + torch.linalg.vector_norm(a, dim=-1))
+        worth = worth + times(reduction.kernel_in_a.mT, left).abs().sum(-1) * far
+    return worth / torch.maximum(terms_of_cost(reduction, theta, a).abs(), negligible_cost(reduction))
 
 
-def _negligible_cost(reduction: Reduction) -> Tensor:
+def negligible_cost(reduction: Reduction) -> Tensor:
+    """Return the cost of missing every reference by :data:`NEGLIGIBLE` of its unit, `()` or one a problem."""
     rows, weights = reduction.rows, reduction.weights
     total = torch.zeros((), dtype=torch.float64, device=reduction.T.device) + torch.finfo(torch.float64).tiny
     for term in rows.tracking:

@@ -82,7 +82,11 @@ class Solved(NamedTuple):
         weak = None if self.weak is None else change(self.weak)
         return Solved(change(self.v), change(self.lam), change(self.active), change(self.info), weak)
 
-    def put(self, samples: Tensor, part: Solved) -> None:
+    def at(self, place: tuple[int, ...]) -> Solved:
+        """Return the solution of one sample."""
+        return self.map(lambda x: x[place])
+
+    def put(self, samples: Tensor | tuple[int, ...], part: Solved) -> None:
         """Write the solution of some samples in place."""
         for whole, of_samples in zip(self, part, strict=True):
             if whole is not None and of_samples is not None:

@@ -9,20 +9,22 @@ from typing import Protocol
 import torch
 from torch import Tensor
 
-from ..autodiff import carries_derivative
+from ..autodiff import carries_derivative, is_plain
 from ..batching import times
 from ..data.hankel import HankelData
 from ..data.hankel_batch import HankelBatch
 from ..errors import Status
 from ..problem.cost import mismatch, optimal_cost
 from ..problem.reduction import Reduction
-from .consistency import rounding_of
+from .consistency import coefficients, excess_cost, inconsistency
 from .engines import Sets
 from .outcome import Planned, joined
 from .solver import Solver
 
 #: The results that a plan computes when asked.
 NAMES = ("g", "value", "slack")
+#: Coefficients that are off by more, in cost or in a row, relative, are computed anew in extended precision.
+ACCURATE = 1e-10
 
 
 class Later(Protocol):
@@ -122,9 +124,8 @@ class Recovery:
         reduction = self.reduction
         a = times(reduction.A_theta, self.theta) - times(reduction.A_lam, self.planned.lam)
         with torch.no_grad():
-            v = torch.cat([x.detach().flatten(-2) for x in (self.planned.u, self.planned.y)], dim=-1)
-            rounding = rounding_of(reduction.detach(), self.theta.detach(), a.detach(), v)
-        a = a + rounding
+            accurate = self._accurate(reduction.detach())
+        a = accurate + (a - a.detach())  # the difference is zero, and carries the graph
         a = a[..., self.solver.sizes.slack :]
         is_spc = a.shape[-1] < self.data.basis.shape[-1]
         basis = self.data.basis.to(a.device)[..., : a.shape[-1]]
@@ -135,6 +136,24 @@ class Recovery:
         if is_spc:
             D = D[..., : D.shape[-2] - self.data.horizon * self.data.n_y, :]  # g is in the row space of W
         return times(torch.linalg.pinv(D, rtol=reduction.rows.tolerance), times(D @ basis, a))
+
+    def _accurate(self, reduction: Reduction) -> Tensor:
+        """Return the coefficients of the plan: those of samples that double precision does not do, in extended one."""
+        theta, planned = self.theta.detach(), self.planned
+        lam, uy = planned.lam.detach(), [x.detach().flatten(-2) for x in (planned.u, planned.y)]
+        uy_flat = torch.cat(uy, dim=-1)
+        a = coefficients(reduction, theta, lam, uy_flat)
+        if not all(map(is_plain, (theta, lam, *uy))):
+            return a
+        excess = excess_cost(reduction, theta, a, lam, uy_flat)
+        off = torch.maximum(excess, inconsistency(reduction, a, uy_flat))
+        doubtful = (planned.info[..., 0] == Status.SOLVED) & ~(off <= ACCURATE)
+        if not bool(doubtful.any()):
+            return a
+        v = joined(self.solver.sizes, planned.u, planned.y, planned.du, lam).detach()
+        if planned.du is None:
+            v[..., self.solver.sizes.u + self.solver.sizes.y :] = torch.nan  # boxes leave the changes to u
+        return self.solver.accurate_coefficients(theta, v, lam, a, doubtful)
 
     def _value(self) -> Tensor:
         planned = self.planned

@@ -22,25 +22,18 @@ from ..sets.blocks import Blocks
 from ..sets.bounds import Bounds
 from ..sets.feasible import FeasibleSet
 from ..sets.units import in_units
-from ..sets.values import values_of
 from ..shapes import broadcast_shapes
-from . import kernels
-from .active_set import solve_active
-from .certificate import is_infeasible
 from .compiled import CompiledPlanner
-from .consistency import excess_cost, inconsistency
+from .consistency import coefficients, excess_cost, inconsistency
 from .engines import Engines, Sets
+from .judge import Judge
 from .kernels import PlannedArrays
-from .optimality import BATCHED, Optimality
-from .outcome import ACCEPTANCE, LOGGER, JudgedSets, Planned, Solved, check_finite, joined, report_failures
-from .projected_system import newton_step
+from .last_resort import LastResort
+from .outcome import ACCEPTANCE, LOGGER, Planned, Solved, check_finite, joined, report_failures
+from .screen import Screen
 from .second_look import SecondLook
 from .selection import uncharged
 from .single import SingleSolver
-from .weakness import WEAKLY_ACTIVE, is_without_multiplier
-
-#: Eigenvalues of D below this hold their direction: it counts as active.
-HELD = 1e-9
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,9 +83,9 @@ class Solver:
         return CompiledPlanner.of(self.in_units.reduction, self.unit)
 
     @cached_property
-    def optimality(self) -> Optimality:
-        """The paper's F, for batches."""
-        return Optimality(self.reduction, BATCHED)
+    def judge(self) -> Judge:
+        """The judge of what engines find."""
+        return Judge(self.reduction, self.engines)
 
     def solve(self, theta: Tensor, sets: Sets, on_failure: str) -> Planned:
         """Solve for every theta, without a graph.
@@ -106,10 +99,14 @@ class Solver:
             ValueError: values that are not finite.
             InfeasibleError, SolveError: with `on_failure="raise"`, if a sample has no accepted solution.
         """
-        quick = self.compiled.solve(theta, sets) if self.compiled is not None and self.engine != "daqp" else None
+        may_be_quick = self.compiled is not None and self.engine != "daqp" and self.is_clear
+        quick = self.compiled.solve(theta, sets) if may_be_quick and self.compiled is not None else None
+        if quick is not None and not sets.is_box:
+            lam, v = torch.from_numpy(quick.lam), torch.from_numpy(quick.v)
+            quick.convinces[...] &= self.screen.vouches(theta, lam, v).numpy().reshape(quick.convinces.shape)
         if quick is not None and quick.convinces.all():
             return self._planned(quick.v, quick.lam, quick.active, quick.info, quick.weak, sets)
-        if self.single is not None and isinstance(sets, Bounds):
+        if self.single is not None and self.is_clear and isinstance(sets, Bounds):
             planned = self.single.solve(theta, sets, self.engine)
             if planned is not None:
                 return planned
@@ -127,12 +124,51 @@ class Solver:
     def _solve_generally(self, theta: Tensor, sets: Sets) -> Solved:
         """Solve by engines, judge, second look and certificate, whatever the problem."""
         check_finite(theta, self.sizes)
-        solved = self.in_units._solve_flat(theta, in_units(sets, self.unit))
-        solved = solved._replace(v=solved.v * self.unit, lam=solved.lam / self.unit)
-        if self.reduction.is_selection:
-            excess = excess_cost(self.reduction, theta, solved.lam, solved.v)
-            solved.empty(~solved.failed & ~(excess <= ACCEPTANCE.excess), Status.FAILED)
-        return solved
+        own = in_units(sets, self.unit)
+        solved = self.in_units._solve_flat(theta, own)
+        self._settle(solved, theta, own)
+        return solved._replace(v=solved.v * self.unit, lam=solved.lam / self.unit)
+
+    @property
+    def is_clear(self) -> bool:
+        """Whether double precision vouches for plans: one optimum, by a map whose verification needed no more."""
+        return self.reduction.excess is None and not self.reduction.is_selection
+
+    def _doubtful(self, solved: Solved, theta: Tensor, sets: Sets) -> Tensor:
+        """Return the samples that the last resort looks at, `(*batch,)`."""
+        failed = solved.failed
+        lost = failed & ~self.reduction.rows.unreachable(theta)
+        if self.is_clear and sets.is_box:
+            return lost
+        if not self.is_clear and not sets.is_box:
+            return lost | ~failed
+        lam, v = solved.lam / self.unit, solved.v * self.unit
+        if self.is_clear:
+            return lost | (~failed & ~self.screen.vouches(theta, lam, v))
+        excess = excess_cost(self.reduction, theta, coefficients(self.reduction, theta, lam, v), lam, v)
+        return lost | (~failed & ~(excess <= ACCEPTANCE.excess))
+
+    @cached_property
+    def screen(self) -> Screen:
+        """The screen of plans whose sets are no boxes."""
+        return Screen.of(self.reduction)
+
+    def _settle(self, solved: Solved, theta: Tensor, sets: Sets) -> None:
+        """Have the last resort prove, solve or refuse what the engines leave; all in units, in place."""
+        doubtful = self._doubtful(solved, theta, sets)
+        if not bool(doubtful.any()):
+            return
+        found, lost = self._resort_of(doubtful.shape).look_at(solved, theta, sets, doubtful)
+        solved.empty(lost, Status.FAILED)
+        if not found:
+            return
+        v, lam = torch.nan_to_num(solved.v), solved.lam.clone()
+        for at, plan in found.items():
+            v[at], lam[at] = torch.from_numpy(plan.v).to(v), torch.from_numpy(plan.lam).to(v)
+        judged = self.in_units.judge.judged(v, lam, sets, torch.zeros((), device=v.device), solved.info[..., 1])
+        for at, plan in found.items():
+            solved.put(at, judged._replace(v=v).at(at))
+            solved.info[at][0], solved.info[at][2] = float(Status.SOLVED), plan.proof.residual
 
     def _completed(self, quick: PlannedArrays, theta: Tensor, sets: Sets) -> Solved:
         """Solve the samples generally that do not convince."""
@@ -145,6 +181,22 @@ class Solver:
         LOGGER.debug("the compiled kernel left %d of %d samples to the engines", len(rest), len(theta))
         solved.put(rest, self._solve_generally(theta[rest], part))
         return solved
+
+    def accurate_coefficients(self, theta: Tensor, v: Tensor, lam: Tensor, a: Tensor, where: Tensor) -> Tensor:
+        """Return a `(*batch, r)` with that of some samples computed in extended precision.
+
+        v, lam as in `Solved`; entries of v that are NaN are unknown.
+        """
+        return self._resort_of(where.shape).coefficients(theta, v / self.unit, lam * self.unit, a, where)
+
+    def _resort_of(self, batch: torch.Size) -> LastResort:
+        """What settles the samples that no engine does."""
+        shared = self.reduction.G.ndim == 2
+        return self._last_resort if shared else LastResort(self.reduction.of_batch(batch), self.unit)
+
+    @cached_property
+    def _last_resort(self) -> LastResort:
+        return LastResort(self.reduction, self.unit)
 
     def jacobian(self, planned: Planned, sets: Sets) -> Blocks:
         """Return D, the Jacobian of the projection at a solution, as :class:`ProjectedSystem` takes it."""
@@ -177,7 +229,7 @@ class Solver:
 
     def _solve_all(self, theta: Tensor, sets: Sets) -> Solved:
         """Run the first engine on all samples, the next one on those that it left."""
-        v0 = self.optimality.unconstrained(theta)
+        v0 = self.judge.optimality.unconstrained(theta)
         first, *others = self.engines.in_order(self.engine, v0, sets)
         solved, gap = self._attempt(first, theta, v0, sets)
         for name in others:
@@ -204,14 +256,15 @@ class Solver:
             v0 = v0 + moved
         else:
             found, moved = self.engines.run(engine, v0, sets), torch.zeros(())
-        raw, error = self.optimality.displaced(v0, found.lam), self.optimality.error(theta, found.lam)
-        solved = self._judged(raw, found.lam, sets, error, found.iterations)
+        raw, error = self.judge.optimality.displaced(v0, found.lam), self.judge.optimality.error(theta, found.lam)
+        solved = self.judge.judged(raw, found.lam, sets, error, found.iterations)
         doubtful = ~(solved.info[..., 2] <= ACCEPTANCE.convincing)
         solved.info[..., 2] -= torch.where(doubtful, 0.0, error)  # a bound that convinces is not part of what is told
         if bool(doubtful.any()):
             self._look_again(solved, theta, moved, sets, doubtful)
         if self.reduction.is_selection:
-            missed = inconsistency(self.reduction, theta, solved.lam, solved.v)
+            a = coefficients(self.reduction, theta, solved.lam, solved.v)
+            missed = inconsistency(self.reduction, a, solved.v)
             solved.info[..., 0][~(missed <= ACCEPTANCE.of_selection)] = int(Status.FAILED)
             solved.info[..., 2] = torch.maximum(solved.info[..., 2], missed)
         solved.info[..., 0][self.reduction.rows.unreachable(theta)] = int(Status.FAILED)
@@ -227,71 +280,17 @@ class Solver:
             moved = moved[where] if moved.ndim else moved
         if isinstance(sets, Bounds):
             sets = sets.of_samples(where)
-        step = partial(solver._step, sets=sets, held=before.lam != 0)
+        step = partial(solver.judge.step, sets=sets, held=before.lam != 0)
         look = SecondLook(solver.reduction)
         lam, raw = look.polished(theta, before.lam, moved, step)
-        judged = solver._judged(raw, lam, sets, look.missed_equalities(theta, lam), before.info[..., 1])
+        judged = solver.judge.judged(raw, lam, sets, look.missed_equalities(theta, lam), before.info[..., 1])
         better = judged.info[..., 2] < before.info[..., 2]
         better = better & doubtful if where is doubtful else better
         solved.put(better if where is doubtful else where[better], judged.map(lambda x: x[better]))
 
-    def _step(self, raw: Tensor, lam: Tensor, sets: Sets, held: Tensor) -> Tensor:
-        """Return Newton's step on the multipliers; for boxes on those of the rows that are held."""
-        if isinstance(sets, Bounds):
-            on = torch.where(lam > 0, sets.upper, sets.lower)
-            missed = torch.where(held & on.isfinite(), raw - on, 0.0)
-            return solve_active(self.reduction.G, self.reduction.Ct, held, missed)[0]
-        order, inverse, gamma = self.engines.order, self.engines.inverse, self.engines.gamma
-        pushed = raw[..., order] + gamma * lam[..., order]
-        missed = raw[..., order] - sets.prox(pushed, gamma)
-        return newton_step(self.engines.G_in_parts, sets, sets.jacobians(pushed, gamma), missed, gamma)[..., inverse]
-
-    def _judged(self, raw: Tensor, lam: Tensor, sets: Sets, error: Tensor, iterations: Tensor) -> Solved:
-        """Judge multipliers, given V theta - G lam and its error."""
-        judge = self._judge_box if isinstance(sets, Bounds) else self._judge_sets
-        v, residual, active, weak, counts = judge(raw, lam, sets, error)  # type: ignore[arg-type]
-        failed = ~(residual <= ACCEPTANCE.residual)
-        info = torch.stack([x.double() for x in (failed * Status.FAILED, iterations, residual, *counts)], dim=-1)
-        return Solved(v, lam, active, info, weak)
-
-    def _judge_box(self, raw: Tensor, lam: Tensor, sets: Bounds, error: Tensor) -> JudgedSets:
-        v, residual, active, n_active, n_weakly_active = self.optimality.judge(raw, lam, *sets.tensors, error)
-        return JudgedSets(v, residual, active, None, (n_active, n_weakly_active))
-
-    def _judge_sets(self, raw: Tensor, lam: Tensor, sets: FeasibleSet, error: Tensor) -> JudgedSets:
-        """Judge with the projection onto the sets; count the directions that D holds, block by block."""
-        batch, G = raw.shape[:-1], self.reduction.G
-        values = values_of(sets, batch, raw.device)
-        if values is not None and kernels.has_kernel_for(raw, values):
-            _, (G,), (flat, multipliers) = flatten_batch((G,), (raw, lam))
-            verdict = kernels.judge_sets(G, flat, multipliers, values)
-            v, missed, weak, active, of_each = (x.reshape(*batch, x.shape[-1]) for x in verdict)
-            residual = self.optimality.residual(lam, missed, error)
-            return JudgedSets(v, residual, active, weak, (of_each[..., 0], of_each[..., 1]))
-        order, inverse, gamma = self.engines.order, self.engines.inverse, self.engines.gamma
-        raw = raw[..., order]
-        lam_in_parts, diagonal = lam[..., order], self.engines.G_in_parts.diagonal(dim1=-2, dim2=-1)
-        # No multiplier moves a row that the equalities decide, and no price does.
-        step = torch.where(sets.largest_of_group(diagonal) > 0, gamma, 0.0)
-        v = sets.prox(raw + step * lam_in_parts, step)
-        missed = (raw - v).abs() / (1 + sets.largest_of_coupled(v.abs()))
-        residual = self.optimality.residual(lam, missed, error)
-        weak = sets.weak(v, is_without_multiplier(v, lam_in_parts, diagonal)).expand_as(v)
-        d, _ = sets.spectral(sets.freed(sets.jacobians(v + gamma * lam_in_parts, gamma), weak))
-        active = (d < HELD).expand_as(v)
-        counts = active.sum(-1), sets.touching(v, weak, WEAKLY_ACTIVE).expand(v.shape[:-1])
-        return JudgedSets(v[..., inverse], residual, active[..., inverse], weak[..., inverse], counts)
-
     def _mark_failures(self, solved: Solved, theta: Tensor, v0: Tensor, gap: Tensor | None, sets: Sets) -> None:
         """Look for certificates; leave NaN for v and nothing else of a sample without a solution."""
         failed = solved.failed
-        Ct, unreachable = self.reduction.Ct, self.reduction.rows.unreachable(theta)
-        if isinstance(sets, Bounds):
-            rest = failed.nonzero()[:, 0]
-            proven = torch.zeros_like(failed)
-            proven[rest] = is_infeasible(Ct if Ct.ndim == 2 else Ct[rest], v0[rest], sets.of_samples(rest), None)
-        else:
-            order = self.engines.order
-            proven = is_infeasible(Ct[..., order, :], v0[..., order], sets, None if gap is None else gap[..., order])
-        solved.empty(failed & ~(proven | unreachable), Status.FAILED)
-        solved.empty(failed & (proven | unreachable), Status.INFEASIBLE)
+        proven = self.judge.infeasible(failed, v0, gap, sets) | self.reduction.rows.unreachable(theta)
+        solved.empty(failed & ~proven, Status.FAILED)
+        solved.empty(failed & proven, Status.INFEASIBLE)
