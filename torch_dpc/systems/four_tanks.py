@@ -51,8 +51,10 @@ class FourTanks(Ode):
 
     The inputs are the voltages v_1, v_2 [V] and the outputs the levels of the lower tanks h_1, h_2 [cm]. A pump does
     not run backwards: a negative voltage counts as zero. After a reset the plant is at rest at the voltages of the
-    operating point. Tanks do not overflow. Record with `collect(plant, ..., offset=plant.voltages, amplitude=0.5)`: around
-    0 V the tanks run empty.
+    operating point. Tanks do not overflow.
+
+    Record around the operating point, `collect(plant, ..., offset=plant.voltages, amplitude=0.5)`: around 0 V the tanks
+    run empty.
 
     Source: K. H. Johansson, "The quadruple-tank process: a multivariable laboratory process with an adjustable zero",
     IEEE Transactions on Control Systems Technology 8(3), 2000, 456-465.
