@@ -46,7 +46,7 @@ FULL, RANDOM = "everything", "nothing: random noise"
 SEARCHES = (20, 100, 500)  # queries a window
 DIRECTIONS = 10
 TITLES = {"masses": "Oscillating masses", "quadrotor": "Quadrotor"}
-LOOKS = {"psi, one step or search": ("o", "#d55e00"), "psi, projected gradient": ("s", "#35178c")}
+LOOKS = {r"$\psi$, one step or search": ("o", "#d55e00"), r"$\psi$, projected gradient": ("s", "#35178c")}
 LOOKS["error in closed loop"] = ("D", "#0072b2")
 #: How what is known begins -> the heading it is drawn under.
 GROUPS = {"everything": "everything", "other recording": "other data", "half": "other data", "150": "other data"}
@@ -167,22 +167,34 @@ def group_of(knows: str) -> str:
     return "the controller's answers alone"
 
 
+def as_formula(text: str) -> str:
+    """Return a name with its lambdas as matplotlib sets them."""
+    return re.sub(r"lambda_(\w)", r"$\\lambda_\1$", text).replace(" x ", " × ")
+
+
+def places_of(axes: Any, lines: list[tuple[str, str, list[str]]]) -> list[float]:
+    """Return where each line is drawn, and write the headings of groups of several lines."""
+    groups = [group_of(knows) for _, knows, _ in lines]
+    places: list[float] = []
+    place = -1.0
+    for i, group in enumerate(groups):
+        place += 1
+        if i == 0 or groups[i - 1] != group:
+            place += 0.3 if i else 0.0
+            if groups.count(group) > 1:
+                look = {"transform": axes.get_yaxis_transform(), "ha": "right", "va": "center", "weight": "bold"}
+                axes.text(-0.02, place, as_formula(group), **look)
+                place += 1
+        places.append(place)
+    return places
+
+
 def plot(path: Path, rows: Rows) -> None:
     """Draw the shares, one panel a plant, one line a kind of knowledge under the heading of its group."""
     style()
     lines = cases(rows, PLANTS[0])
-    figure, panels = plt.subplots(1, 2, figsize=(9.0, 10.0), sharey=True, width_ratios=(1.2, 1))
-    places: list[float] = []
-    place, group = -1.0, ""
-    for _, knows, _ in lines:
-        place += 2 if group_of(knows) != group else 1
-        group = group_of(knows)
-        places.append(place)
-        if len(places) == 1 or places[-2] < place - 1:
-            look = {"transform": panels[0].get_yaxis_transform(), "ha": "right", "va": "center", "weight": "bold"}
-            panels[0].text(-0.02, place - 1, group, **look)
-            for axes in panels:
-                axes.axhline(place - 1.5, color="0.8", linewidth=0.6)
+    figure, panels = plt.subplots(1, 2, figsize=(9.0, 9.6), sharey=True, width_ratios=(1.2, 1))
+    places = places_of(panels[0], lines)
     for axes, plant in zip(panels, PLANTS, strict=True):
         for place, (_, knows, methods) in zip(places, lines, strict=True):
             drawn = [(methods[0], "decrease", -0.25), (MORE_STEPS, "decrease", 0.0), (methods[0], "error", 0.25)]
@@ -194,11 +206,11 @@ def plot(path: Path, rows: Rows) -> None:
         axes.axvline(100, color="black", linewidth=0.8, linestyle=(0, (4, 2)))
         axes.axvline(0, color="black", linewidth=0.8)
         axes.set_title(TITLES[plant])
-    names = [knows.replace("lambda", r"$\lambda$").replace(" x ", " × ") for _, knows, _ in lines]
-    panels[0].set_yticks(places, [re.sub(r"\$_(\w)", r"_\1$", name) for name in names])
+        axes.grid(axis="y", visible=False)
+    panels[0].set_yticks(places, [as_formula(knows) for _, knows, _ in lines])
     figure.supxlabel("share of what Algorithm 1 does with full knowledge [%]", fontsize=10)
-    write_note(panels[0], f"{len(np.unique(rows['seed']))} seeds, bars: 95 %\npaired bootstrap interval", "lower right")
-    panels[0].set_ylim(places[-1] + 0.5, -0.6)
+    write_note(panels[1], f"{len(np.unique(rows['seed']))} seeds, bars: 95 %\npaired bootstrap\ninterval", "lower left")
+    panels[0].set_ylim(places[-1] + 0.7, -0.7)
     for name, (marker, colour) in LOOKS.items():
         panels[0].plot([], [], marker, color=colour, markersize=4, label=name)
     figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=3)
