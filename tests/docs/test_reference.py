@@ -30,3 +30,10 @@ def test_every_public_object_has_a_page(room):
     public = {name: getattr(room, name) for name in room.__all__}
     missing = [name for name, thing in public.items() if not isinstance(thing, ModuleType) and id(thing) not in pages]
     assert not missing
+
+
+def test_every_study_has_a_question():
+    """The table of studies names every page of its list."""
+    table, toctree = (REFERENCE.parents[1] / "studies.md").read_text().split("```{toctree}")
+    listed = [line for line in toctree.splitlines() if re.fullmatch(r"[a-z_]+", line)]
+    assert listed and re.findall(r"\{doc\}`(\w+)`", table) == listed
