@@ -64,7 +64,7 @@ def test_multipliers_that_are_a_little_off_are_polished_or_refused(problem, monk
     layer, inputs, right = problem
     engine_that_spoils(monkeypatch, lambda lam: lam * (1 + off))
     monkeypatch.setattr(SecondLook, "polished", unpolished)
-    monkeypatch.setattr(last_resort, "settled", lambda *_: None)
+    monkeypatch.setattr(last_resort, "settled", lambda *_: dpc.Status.FAILED)
     plan = layer(*inputs, y_ref=Y_REF)
     assert not solved_and_wrong(plan, right).any() and (plan.info.status == dpc.Status.FAILED).all()
 

@@ -7,7 +7,7 @@ minimiser to the sets is near 1.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -107,33 +107,68 @@ class Scaled:
     def back(self, problem: Extended, sample: Sample, point: Point) -> tuple[Array, Array]:
         """Return x and the multipliers of v of a point, `(n_x,)` and `(N,)`."""
         at, x = self.at, self.at.start + self.reach * (self.at.basis @ point.y)
-        lam = np.zeros(len(sample.c), dtype=np.longdouble)
+        lam = self._multipliers(point, len(sample.c))
+        if len(at.held):
+            slope = np.zeros_like(x)
+            slope[: problem.n_xi] = x[: problem.n_xi] - sample.xi0
+            lam[at.held] = self._of_held(slope + lam @ problem.M)
+        return x, without_work(lam, problem.M[:, problem.n_xi :])
+
+    def direction(self, problem: Extended, point: Point) -> Array:
+        """Return the direction of the multipliers of an iterate that diverges, `(N,)`; zero on rows with a price."""
+        d = self._multipliers(replace(point, z=np.where(np.isinf(self.program.price), point.z, 0)), len(problem.M))
+        if len(self.at.held):
+            d[self.at.held] = self._of_held(d @ problem.M)
+        size = np.abs(d).max(initial=0.0)
+        return d / size if size > 0 else d
+
+    def _of_held(self, slope: Array) -> Array:
+        """Return the multipliers of the held rows that balance a slope in x."""
+        at = self.at
+        balance: Array = -(at.pinv.T @ (at.columns * slope)) / at.length
+        return balance
+
+    def _multipliers(self, point: Point, n: int) -> Array:
+        """Return the multipliers of v `(n,)` of the rows and cones of the program."""
+        lam = np.zeros(n, dtype=np.longdouble)
         binds = point.z > np.maximum(point.s, 0)  # a multiplier that is small beside its slack is zero
         np.add.at(lam, self.places, np.where(binds, self.signs * point.z * self.reach / self.sizes, 0))
         deep = inside(point.s_cone)
         for k, (block, size) in enumerate(zip(self.blocks, self.of_blocks, strict=True)):
             z = point.z_cone[k]
             if z[0] > max(deep[k], 0):
-                n = len(block.rows)
-                lam[block.rows] -= (z[:n] if block.center is None else z[1 : n + 1]) * self.reach / size
-        if len(at.held):
-            slope = np.zeros_like(x)
-            slope[: problem.n_xi] = x[: problem.n_xi] - sample.xi0
-            lam[at.held] = -(at.pinv.T @ (at.columns * (slope + lam @ problem.M))) / at.length
-        return x, _without_work(lam, problem.M[:, problem.n_xi :])
+                k_rows = len(block.rows)
+                held = z[:k_rows] if block.center is None else z[1 : k_rows + 1]
+                lam[block.rows] -= held * self.reach / size
+        return lam
 
 
-def planned(problem: Extended, sample: Sample, ends: Ends) -> list[tuple[Array, Array]]:
-    """Return candidates x with multipliers of v `(N,)`, in long double: polished, and as the method left them."""
-    scaled = scaled_program(problem, sample, ends)
-    point, _ = solve(scaled.program)
-    return [scaled.back(problem, sample, one) for one in (polished(scaled.program, point), point)]
+@dataclass(frozen=True, eq=False)
+class Outcome:
+    """What the method found for a sample, in long double.
+
+    Attributes:
+        candidates: x with multipliers of v, `(n_x,)` and `(N,)`: polished, and as the method left them.
+        direction: of its last multipliers, which separates trajectories and sets where there is no plan, `(N,)`.
+    """
+
+    candidates: list[tuple[Array, Array]]
+    direction: Array
 
 
-def scaled_program(problem: Extended, sample: Sample, ends: Ends) -> Scaled:
+def outcome_of(problem: Extended, sample: Sample, ends: Ends, centre: Array) -> Outcome:
+    """Solve a sample; flat directions of the cost are charged for how far they lead from `centre`, `(n_k,)`."""
+    scaled = scaled_program(problem, sample, ends, centre)
+    best, last = solve(scaled.program)
+    candidates = [scaled.back(problem, sample, one) for one in (polished(scaled.program, best), best)]
+    return Outcome(candidates, scaled.direction(problem, last))
+
+
+def scaled_program(problem: Extended, sample: Sample, ends: Ends, centre: Array) -> Scaled:
     """Return the program of a sample."""
     moves = np.abs(problem.M).max(axis=1, initial=0.0) > 0
-    at = _coordinates(problem, sample, ends, moves)
+    origin = np.concatenate([sample.xi0, centre])
+    at = _coordinates(problem, sample, ends, moves, origin)
     M, c = problem.M @ at.basis, sample.c + problem.M @ at.start
     places, signs = _interval_ends(ends, moves, at.held)
     G = signs[:, None] * M[places]
@@ -155,20 +190,17 @@ def scaled_program(problem: Extended, sample: Sample, ends: Ends) -> Scaled:
     reach: Any = outside if outside > 0 else np.longdouble(1)
     weight = np.ones(len(at.start), dtype=np.longdouble)
     weight[problem.n_xi :] = CHARGE
-    away = at.start.copy()
-    away[: problem.n_xi] -= sample.xi0
-    P, q = (at.basis.T * weight) @ at.basis, at.basis.T @ (weight * away)
+    P, q = (at.basis.T * weight) @ at.basis, at.basis.T @ (weight * (at.start - origin))
     program = ConeProgram(P, q / reach, G / sizes[:, None], h / sizes / reach, price / reach, B, b / reach)
     return Scaled(program, at, places, signs, sizes, blocks, of_blocks, weight, reach)
 
 
-def _coordinates(problem: Extended, sample: Sample, ends: Ends, moves: Array) -> Coordinates:
-    """Return the unknowns, held rows eliminated, from the unconstrained minimiser."""
+def _coordinates(problem: Extended, sample: Sample, ends: Ends, moves: Array, start: Array) -> Coordinates:
+    """Return the unknowns, held rows eliminated, near a start `(n_x,)`."""
     M, n = problem.M, problem.M.shape[1]
     columns = np.ones(n, dtype=np.longdouble)
     flat = np.abs(M[:, problem.n_xi :]).max(axis=0, initial=0.0)
     columns[problem.n_xi :] = 1 / np.where(flat > 0, flat, 1)
-    start = np.concatenate([sample.xi0, np.zeros(n - problem.n_xi, dtype=np.longdouble)])
     is_held, target = (ends.lower == ends.upper) & np.isinf(ends.price), ends.lower.astype(np.longdouble)
     for block in ends.blocks:
         if block.is_point:
@@ -197,7 +229,7 @@ def _lengths(rows: Array) -> Array:
     return np.where(length > 0, length, 1)
 
 
-def _without_work(lam: Array, K: Array) -> Array:
+def without_work(lam: Array, K: Array) -> Array:
     """Return the multipliers without the work along K `(N, n_k)` that the charge on flat directions leaves them."""
     on = (lam != 0).nonzero()[0]
     rows = (K[on] * np.abs(lam[on])[:, None]).T

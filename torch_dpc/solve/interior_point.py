@@ -74,8 +74,8 @@ class Point:
     z_cone: Array
 
 
-def solve(program: ConeProgram) -> tuple[Point, float]:
-    """Return the best iterate, and its largest residual or gap, relative to its terms."""
+def solve(program: ConeProgram) -> tuple[Point, Point]:
+    """Return the best iterate and the last one, whose multipliers diverge where the program has no solution."""
     p, soft = program, np.isfinite(program.price)
     point = _start(p, soft)
     best, least = point, np.inf
@@ -121,7 +121,7 @@ def solve(program: ConeProgram) -> tuple[Point, float]:
             break
         for name in point.__dataclass_fields__:
             setattr(point, name, getattr(point, name) + length * getattr(change, name))
-    return best, least
+    return best, point
 
 
 def _copy(point: Point) -> Point:

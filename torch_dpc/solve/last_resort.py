@@ -18,10 +18,13 @@ from ..problem.extended import Extended, Sample
 from ..problem.long_double import Array
 from ..problem.reduction import Reduction
 from ..sets.values import BALL, SetValues, values_of
-from .cone_program import Block, Ends, planned
+from .cone_program import Block, Ends, outcome_of
 from .engines import Sets
 from .outcome import Solved
-from .proof import Proof, coefficients, prove
+from .proof import Proof, coefficients, excludes, prove
+
+#: Times that a sample is solved, each from where the charge on flat directions led before.
+ROUNDS = 3
 
 
 @dataclass(frozen=True)
@@ -55,8 +58,10 @@ class LastResort:
 
     def look_at(
         self, solved: Solved, theta: Tensor, sets: Sets, doubtful: Tensor
-    ) -> tuple[dict[tuple[int, ...], Settled], Tensor]:
-        """Return the plans of doubtful samples by their place in the batch, and which solved ones are lost.
+    ) -> dict[tuple[int, ...], Settled | Status]:
+        """Return the plans of doubtful samples by their place in the batch, or why there is none.
+
+        What the engines found of the others stands.
 
         Args:
             solved: what the engines found, in units.
@@ -64,24 +69,22 @@ class LastResort:
             sets: in units.
             doubtful: `(*batch,)`.
         """
-        found: dict[tuple[int, ...], Settled] = {}
-        batch, lost = doubtful.shape, torch.zeros_like(doubtful)
+        found: dict[tuple[int, ...], Settled | Status] = {}
+        batch = doubtful.shape
         values = values_of(sets, batch, theta.device)
         theta = theta.expand(*batch, theta.shape[-1])
         for i, at in _places(doubtful):
             is_solved = bool(solved.info[at][0] == Status.SOLVED)
             if values is None:  # a set of the user's own
-                lost[at] = is_solved
+                if is_solved:
+                    found[at] = Status.FAILED
                 continue
             problem, ends = self.problem(i), ends_of(values, i)
             sample = problem.sample(theta[at].cpu().numpy())
             if is_solved and prove(problem, sample, ends, *(x[at].cpu().numpy() for x in (solved.v, solved.lam))).holds:
                 continue
-            plan = settled(problem, sample, ends)
-            if plan is not None:
-                found[at] = plan
-            lost[at] = is_solved and plan is None
-        return found, lost
+            found[at] = settled(problem, sample, ends)
+        return found
 
     def coefficients(self, theta: Tensor, v: Tensor, lam: Tensor, a: Tensor, where: Tensor) -> Tensor:
         """Return a `(*batch, r)` with that of the plans v with multipliers lam, in units, in place of some samples'."""
@@ -95,19 +98,38 @@ class LastResort:
         return a
 
 
-def settled(problem: Extended, sample: Sample, ends: Ends) -> Settled | None:
-    """Return the plan of a sample, solved anew; None if none was proven."""
-    best: Settled | None = None
-    with np.errstate(all="ignore"):  # an iterate that overflows ends the method
-        candidates = planned(problem, sample, ends)
-    for x, lam in candidates:
-        if not (np.isfinite(x).all() and np.isfinite(lam).all()):
-            continue
-        v = _within(ends, (sample.c + problem.M @ x).astype(float))
-        found = Settled(v, lam.astype(float), prove(problem, sample, ends, v, lam.astype(float), lam))
-        if found.proof.holds and (best is None or found.proof.gap < best.proof.gap):
-            best = found
-    return best
+def settled(problem: Extended, sample: Sample, ends: Ends) -> Settled | Status:
+    """Return the plan of a sample, solved anew; INFEASIBLE if that is proven, or FAILED."""
+    centre = np.zeros(problem.M.shape[1] - problem.n_xi, dtype=np.longdouble)
+    for _ in range(ROUNDS if len(centre) else 1):
+        with np.errstate(all="ignore"):  # an iterate that overflows ends the method
+            outcome = outcome_of(problem, sample, ends, centre)
+        found = [_proven(problem, sample, ends, x, lam) for x, lam in outcome.candidates]
+        proven = [one for one in found if one is not None and one.proof.holds]
+        if proven:
+            return min(proven, key=lambda one: one.proof.gap)
+        if excludes(problem, sample, ends, outcome.direction):
+            return Status.INFEASIBLE
+        centre = outcome.candidates[-1][0][problem.n_xi :]  # the charge on flat directions fades: proximal points
+        if not np.isfinite(centre).all():
+            break
+    return Status.FAILED
+
+
+def _proven(problem: Extended, sample: Sample, ends: Ends, x: Array, lam: Array) -> Settled | None:
+    """Return a candidate in double precision with its proof; None if it is not finite."""
+    if not (np.isfinite(x).all() and np.isfinite(lam).all()):
+        return None
+    v = _within(ends, (sample.c + problem.M @ x).astype(float))
+    return Settled(v, lam.astype(float), prove(problem, sample, ends, v, lam.astype(float), lam))
+
+
+def marked(places: list[tuple[int, ...]], like: Tensor) -> Tensor:
+    """Return a boolean tensor that is true at some places."""
+    where = torch.zeros_like(like)
+    for at in places:
+        where[at] = True
+    return where
 
 
 def _places(where: Tensor) -> list[tuple[int, tuple[int, ...]]]:

@@ -11,13 +11,13 @@ for as far as a plan may go. All of it is in extended precision.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..problem.extended import Extended, Sample
 from ..problem.long_double import Array, back, triangle
-from .cone_program import Ends
+from .cone_program import Ends, without_work
 
 
 @dataclass(frozen=True)
@@ -33,6 +33,9 @@ class ProofSettings:
         pulls: of v on the coefficients, relative to the curvature of the cost, in the order tried; see `coefficients`.
         near: coefficients are taken that are this near v, relative to 1 + |v|.
         charge: root of the charge on directions without cost: v decides, and the least |g| beyond.
+        apart: a certificate must separate by this, relative to its terms.
+        met: what a certificate leaves of a column of M, relative to its terms, counts as zero.
+        faint: entries of a certificate below this fraction of its largest count as zero.
     """
 
     gap: float = 1e-7
@@ -43,6 +46,9 @@ class ProofSettings:
     pulls: tuple[float, ...] = (1e6, 1e9, 1e12, 1e15)
     near: float = 1e-9
     charge: float = 1e-9
+    apart: float = 1e-8
+    met: float = 1e-14
+    faint: float = 1e-12
 
 
 SETTINGS = ProofSettings()
@@ -121,12 +127,39 @@ def prove(problem: Extended, sample: Sample, ends: Ends, v: Array, lam: Array, d
     # A g of double precision reproduces the plan up to the rounding of its terms.
     rounding = 2.0**-53 * (np.abs(problem.posed.C) @ np.abs(a)) / problem.unit
     missed = [(np.abs(reached - v) + rounding) / (1 + np.abs(v)), _outside(ends, v), _equalities(problem, sample, a)]
+    at_price = np.isfinite(ends.price)
+    rounded = 2.0**-52 * (ends.price * (1 + np.abs(v)))[at_price].sum()  # what rounding of v costs at its prices
     return Proof(
         float(cost + _price(ends, reached).sum()),
         float(min(gaps)),
-        _negligible(problem),
+        _negligible(problem) + float(rounded),
         float(max(part.max(initial=0.0) for part in missed)),
     )
+
+
+def excludes(problem: Extended, sample: Sample, ends: Ends, d: Array) -> bool:
+    """Return whether a direction d `(N,)`, or a row that cannot move, proves that no plan lies in the sets.
+
+    By Farkas' lemma: d'M = 0 and d'c > sup {d'v : v in the sets}. d is first freed of what rounding leaves of d'M, and
+    a column of M counts as met by zero only if the sum is nothing beside its own terms.
+    """
+    moves = np.abs(problem.M).max(axis=1, initial=0.0) > 0
+    if (_outside(_without(ends, moves), sample.c) > SETTINGS.apart).any():
+        return True
+    hard = replace(ends, price=np.full_like(ends.price, np.inf))
+    d = np.where(moves & np.isinf(ends.price), d, 0)
+    d = np.where(np.abs(d) > SETTINGS.faint * np.abs(d).max(initial=0.0), d, 0)
+    d = admitted(hard, without_work(admitted(hard, d), problem.M))
+    leak, terms = np.abs(d @ problem.M), np.abs(d) @ np.abs(problem.M)
+    support = _support(hard, d)
+    margin, size = d @ sample.c - support.sum(), np.abs(d) @ np.abs(sample.c) + np.abs(support).sum()
+    return bool((leak <= SETTINGS.met * terms).all() and margin > SETTINGS.apart * size)
+
+
+def _without(ends: Ends, rows: Array) -> Ends:
+    """Return the ends without those of some rows `(N,)`, boolean, and without blocks that hold one of them."""
+    lower, upper = np.where(rows, -np.inf, ends.lower), np.where(rows, np.inf, ends.upper)
+    return replace(ends, lower=lower, upper=upper, blocks=[b for b in ends.blocks if not rows[b.rows].any()])
 
 
 def admitted(ends: Ends, lam: Array) -> Array:

@@ -28,7 +28,7 @@ from .consistency import coefficients, excess_cost, inconsistency
 from .engines import Engines, Sets
 from .judge import Judge
 from .kernels import PlannedArrays
-from .last_resort import LastResort
+from .last_resort import LastResort, Settled, marked
 from .outcome import ACCEPTANCE, LOGGER, Planned, Solved, check_finite, joined, report_failures
 from .screen import Screen
 from .second_look import SecondLook
@@ -99,8 +99,8 @@ class Solver:
             ValueError: values that are not finite.
             InfeasibleError, SolveError: with `on_failure="raise"`, if a sample has no accepted solution.
         """
-        may_be_quick = self.compiled is not None and self.engine != "daqp" and self.is_clear
-        quick = self.compiled.solve(theta, sets) if may_be_quick and self.compiled is not None else None
+        may_be_quick = self.engine != "daqp" and self.is_clear
+        quick = self.compiled.solve(theta, sets) if self.compiled is not None and may_be_quick else None
         if quick is not None and not sets.is_box:
             lam, v = torch.from_numpy(quick.lam), torch.from_numpy(quick.v)
             quick.convinces[...] &= self.screen.vouches(theta, lam, v).numpy().reshape(quick.convinces.shape)
@@ -137,7 +137,8 @@ class Solver:
     def _doubtful(self, solved: Solved, theta: Tensor, sets: Sets) -> Tensor:
         """Return the samples that the last resort looks at, `(*batch,)`."""
         failed = solved.failed
-        lost = failed & ~self.reduction.rows.unreachable(theta)
+        lost = (solved.info[..., 0] == Status.FAILED) if self.is_clear else failed  # where clear, a certificate holds
+        lost = lost & ~self.reduction.rows.unreachable(theta)
         if self.is_clear and sets.is_box:
             return lost
         if not self.is_clear and not sets.is_box:
@@ -158,15 +159,18 @@ class Solver:
         doubtful = self._doubtful(solved, theta, sets)
         if not bool(doubtful.any()):
             return
-        found, lost = self._resort_of(doubtful.shape).look_at(solved, theta, sets, doubtful)
-        solved.empty(lost, Status.FAILED)
-        if not found:
+        found = self._resort_of(doubtful.shape).look_at(solved, theta, sets, doubtful)
+        for status in (Status.FAILED, Status.INFEASIBLE):
+            places = [at for at, why in found.items() if why is status]
+            solved.empty(marked(places, like=doubtful), status)
+        plans = {at: plan for at, plan in found.items() if isinstance(plan, Settled)}
+        if not plans:
             return
         v, lam = torch.nan_to_num(solved.v), solved.lam.clone()
-        for at, plan in found.items():
+        for at, plan in plans.items():
             v[at], lam[at] = torch.from_numpy(plan.v).to(v), torch.from_numpy(plan.lam).to(v)
         judged = self.in_units.judge.judged(v, lam, sets, torch.zeros((), device=v.device), solved.info[..., 1])
-        for at, plan in found.items():
+        for at, plan in plans.items():
             solved.put(at, judged._replace(v=v).at(at))
             solved.info[at][0], solved.info[at][2] = float(Status.SOLVED), plan.proof.residual
 
