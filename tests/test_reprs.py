@@ -1,7 +1,6 @@
 """Every public object says what it is, in one to five lines."""
 
 import inspect
-import warnings
 
 import pytest
 import torch
@@ -36,9 +35,8 @@ def objects():
     controller, plant = dpc.DPCController(LAYER, 3), systems.OscillatingMasses()
     detector = detection.ConsistencyDetector(DATA)
     calibrated = detection.ConsistencyDetector(DATA).calibrate(u, y, false_alarms=0.1)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        objective = tuning.RobustObjective(LAYER, tuning.Windows(u_ini, y_ini, torch.ones(4)), budget)
+    predictor = tuning.Predictor(DATA)
+    objective = tuning.RobustObjective(LAYER, tuning.Windows(u_ini, y_ini, torch.ones(4)), budget, predictor=predictor)
     nearest = dpc.NearestWindows(LAYER, 20)
     policy = attacks.AttackPolicy.for_windows(DATA, (u_ini, y_ini, torch.ones(4), torch.ones(2), torch.tensor(0)))
     made = [
@@ -60,6 +58,7 @@ def objects():
         *(attacks.FiniteDifferenceAttack(LAYER, cost, budget), attacks.RandomSearchAttack(LAYER, cost, budget)),
         *(policy, attacks.PolicyAttack(policy, budget)),
         attacks.SignalAttack(plant, controller, attacks.RunError(), budget),
+        attacks.PoisonedRecording(LAYER, cost, budget, samples=2),
         attacks.robustness_curve(plant, controller, attack, rhos=[0.0, 0.1], y_ref=torch.ones(4), steps=4, batch=2),
         *(detector, calibrated, calibrated.statistic(u_ini, y_ini), detection.Cusum(calibrated.score, 1.0, 2.0)),
         *(tuning.Windows(u_ini, y_ini, torch.ones(4)), objective, tuning.WeightScales(LAYER), tuning.MeanError([0])),
@@ -72,7 +71,7 @@ def objects():
 #: Interfaces, what is returned by what takes long, and what needs an extra (tested below, where it is installed).
 NOT_MADE = {
     *("Attack", "Budget", "ConvexSet", "Plant", "Planner", "TorchPlant"),
-    *("WorstCase", "SensitivityBound", "TuningResult", "Verdict", "Positive", "Semidefinite"),
+    *("WorstCase", "SensitivityBound", "Poisoned", "TuningResult", "Verdict", "Positive", "Semidefinite"),
     *("Quadrotor", "GymPlant"),
 }
 

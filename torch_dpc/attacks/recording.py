@@ -21,6 +21,7 @@ from ..data.hankel import HankelData
 from ..data.recordings import as_recordings
 from ..errors import ExcitationWarning
 from ..layer import DPCLayer
+from ..reprs import Described
 from .budgets import Budget
 from .costs import check_cost
 from .influence import mean_psi
@@ -40,8 +41,8 @@ class PoisonSettings:
 SETTINGS = PoisonSettings()
 
 
-@dataclass(frozen=True, eq=False)
-class Poisoned:
+@dataclass(frozen=True, eq=False, repr=False)
+class Poisoned(Described):
     """A poisoned recording.
 
     Attributes:
@@ -63,7 +64,7 @@ class Poisoned:
         return f"Poisoned({len(self.samples)} of {len(self.p)} samples, psi {self.before:.4g} -> {self.after:.4g})"
 
 
-class PoisonedRecording:
+class PoisonedRecording(Described):
     """Change a few samples of the recorded outputs so that the plans made with the recording suit the attacker.
 
     The first step is Algorithm 1's, the best vertex of the budget for the linearised psi, on the chosen samples. Each
