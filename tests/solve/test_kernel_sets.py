@@ -290,6 +290,16 @@ def test_a_map_with_a_large_error_does_not_convince():
         assert not kernels.plan(replace(of, **{field: 1.1 * most}), sets, theta).convinces.all()
 
 
+def test_rounding_is_bounded_row_by_row_where_the_worst_row_does_not_convince():
+    problem = Problem(4, kinds=(), prices=0.0)
+    of, sets, theta = whole(problem)
+    coarse = replace(of, error_of_theta=0.0, error_of_lam=1.0)
+    assert not kernels.plan(coarse, sets, theta).convinces.any()
+    most = kernels.SETTINGS.convincing / (np.abs(kernels.plan(of, sets, theta).lam * of.unit) @ np.abs(of.G)).max(1)
+    assert kernels.plan(replace(coarse, rounding=0.9 * most.min()), sets, theta).convinces.all()
+    assert not kernels.plan(replace(coarse, rounding=1.1 * most.max()), sets, theta).convinces.any()
+
+
 def test_a_plan_without_a_solution_is_marked():
     problem = Problem(4, kinds=(), prices=0.0)
     of, sets, theta = whole(problem)

@@ -53,6 +53,7 @@ class Reduction:
         error: errors of v, then of Eq a = e, in their units, as the verification bounds them: for a unit of theta, and
             for multipliers that displace v by a unit, `(..., N + n_eq, 2)`.
         excess: [V, -G] minus the exact map, `(..., N, n_theta + N)`, where extended precision was needed; else None.
+        rounding: of each entry of V and G, relative to it, if that is all of the error of v; else 0.
         rows: the data rows behind them.
         weights: the weights behind them.
         constants: the same without a graph; None if this is it.
@@ -73,6 +74,7 @@ class Reduction:
     rows: DataRows
     weights: Weights
     constants: Reduction | None = None
+    rounding: float = 0.0
 
     @property
     def is_selection(self) -> bool:
@@ -204,7 +206,7 @@ def _verified(reduction: Reduction, kernel: Tensor) -> Reduction:
 
     error = stacked([verdict.error for _, verdict in checked])
     if all(verdict.excess is None for _, verdict in checked):
-        return replace(reduction, error=error)
+        return replace(reduction, error=error, rounding=min((verdict.rounding for _, verdict in checked), default=0.0))
     values, A = stacked([found.values for found, _ in checked]), stacked([found.A for found, _ in checked])
     unknown = np.zeros_like(checked[0][0].values)
     excess = stacked([unknown if verdict.excess is None else verdict.excess for _, verdict in checked])

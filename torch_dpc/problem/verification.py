@@ -178,11 +178,13 @@ class Verdict:
             displacement by the multipliers, `(N + n_eq, 2)`. What rounding of the data explains is none.
         doubt: the largest bound on rounding, in the same units.
         excess: values minus the exact map, `(N, m)`; None where double precision did.
+        rounding: of each entry of values, relative to it, if that is all of the error of v; else 0.
     """
 
     error: Array
     doubt: float
     excess: Array | None
+    rounding: float = 0.0
 
 
 def verify(posed: Posed, found: Map, settings: VerificationSettings = SETTINGS) -> tuple[Map, Verdict]:
@@ -217,10 +219,11 @@ def _check(posed: Posed, found: Map, settings: VerificationSettings) -> Verdict:
     doubt = float(_in_units(posed, found, of_v, of_eq).max(initial=0.0))
     of_v *= settings.explained
     excess *= excess > of_v
+    rounding = 0.0 if excess.any() else settings.rounding
     own *= settings.rounding
     excess += own
     missed *= missed > settings.explained * of_eq
-    return Verdict(_in_units(posed, found, excess, missed), doubt, None)
+    return Verdict(_in_units(posed, found, excess, missed), doubt, None, rounding)
 
 
 def _rounding(posed: Posed, found: Map, size: Array, own: Array) -> tuple[Array, Array]:

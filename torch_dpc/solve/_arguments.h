@@ -179,11 +179,11 @@ static int take_constant(
     return 1;
 }
 
-/* Take the tuple (G, V, per_theta, moved, unit, error_of_theta, error_of_lam) and vectors `(count, n)` that say what n
- * is, which is above 0. */
+/* Take the tuple (G, V, per_theta, moved, unit, error_of_theta, error_of_lam, rounding) and vectors `(count, n)` that say
+ * what n is, which is above 0. */
 static int take_map(Buffers *b, PyObject *object, int64_t count, int64_t n, Batch *batch) {
     Map *map = &batch->map;
-    if (!PyTuple_Check(object) || PyTuple_GET_SIZE(object) != 7) return misfit("map");
+    if (!PyTuple_Check(object) || PyTuple_GET_SIZE(object) != 8) return misfit("map");
     PyObject *const *parts = PySequence_Fast_ITEMS(object);
     batch->count = count, batch->n = n;
     const double *G;
@@ -197,6 +197,7 @@ static int take_map(Buffers *b, PyObject *object, int64_t count, int64_t n, Batc
     if (!take_constant(b, parts[3], "moved", 0, n, &map->moved)) return 0;
     if (!take_constant(b, parts[4], "unit", 0, n, &map->unit)) return 0;
     map->error_of_theta = PyFloat_AsDouble(parts[5]), map->error_of_lam = PyFloat_AsDouble(parts[6]);
+    map->rounding = PyFloat_AsDouble(parts[7]);
     return !PyErr_Occurred();
 }
 

@@ -29,6 +29,7 @@ typedef struct {
     const double *moved;                 /* (n): G_ii, and what the error of the map is relative to */
     const double *unit;                  /* (n): of v, powers of two */
     double error_of_theta, error_of_lam; /* of a row of v, relative to theta and to lam in units */
+    double rounding;                     /* of an entry of G, if multipliers meet no other error; else 0 */
 } Map;
 
 /* The arguments of every entry point; what one does not take stays empty. */
@@ -129,6 +130,18 @@ INLINE void judge_sample(const Batch *b, Workspace *w, int64_t i) {
     judge(&sets, w, of_sample(&b->raw, i), of_sample(&b->lam, i), b->settings->weakness, &verdict);
 }
 
+/* The largest entry of |G| |lam|. Overwrites `pushed`. */
+INLINE double largest_of_absolute_product(Workspace *w, const double *G) {
+    double *total = w->curved.pushed, largest = 0.0;
+    memset(total, 0, bytes(w->n));
+    for (int64_t j = 0; j < w->n; j++) {
+        if (w->lam[j] == 0.0) continue;
+        for (int64_t i = 0; i < w->n; i++) total[i] += fabs(G[j * w->n + i] * w->lam[j]);
+    }
+    for (int64_t i = 0; i < w->n; i++) largest = total[i] > largest ? total[i] : largest;
+    return largest;
+}
+
 enum { INFO = 5 };                  /* columns of `info` */
 enum { SOLVED = 0, FAILED = 2 }; /* its status, as torch_dpc.Status has it */
 
@@ -137,7 +150,7 @@ INLINE void plan_sample(const Batch *b, Workspace *w, int64_t i) {
     const Map *map = &b->map;
     const int64_t n = b->n, at = i * n;
     const double *theta = of_sample(&b->theta, i), *v0 = of_sample(&b->v0, i), *G = of_sample(&b->G, i);
-    double *info = b->info + INFO * i, largest = 0.0, error, missed = 0.0;
+    double *info = b->info + INFO * i, largest = 0.0, missed = 0.0, of_lam = 0.0;
     int64_t iterations = 0, counts[2];
     b->succeeded[i] = 0;
     if (!reserve_curved(w)) return;
@@ -154,13 +167,15 @@ INLINE void plan_sample(const Batch *b, Workspace *w, int64_t i) {
     const Verdict verdict = {b->result + at, w->curved.trial, b->is_weak + at, b->is_active + at, counts};
     judge(&sets, w, w->v, w->lam, b->settings->weakness, &verdict);
     for (int64_t j = 0; j < map->n_theta; j++) largest = fmax(largest, fabs(theta[j] * map->per_theta[j]));
-    error = map->error_of_theta * largest;
     for (int64_t j = 0; j < n; j++) {
         missed = !(w->curved.trial[j] <= missed) ? w->curved.trial[j] : missed; /* NaN stays */
-        error += map->error_of_lam * fabs(w->lam[j]) * map->moved[j];
+        of_lam += map->error_of_lam * fabs(w->lam[j]) * map->moved[j]; /* as if the worst row met every multiplier */
         b->result[at + j] *= map->unit[j];
         b->result_lam[at + j] = w->lam[j] / map->unit[j];
     }
+    double error = map->error_of_theta * largest + of_lam;
+    if (!(missed + error <= b->settings->convincing) && map->rounding > 0.0)
+        error += fmin(0.0, map->rounding * largest_of_absolute_product(w, G) - of_lam);
     b->succeeded[i] = solved && missed + error <= b->settings->convincing;
     info[0] = b->succeeded[i] ? SOLVED : FAILED;
     info[1] = (double)iterations;

@@ -52,7 +52,8 @@ class CompiledPlanner:
         diagonal = reduction.G.diagonal()
         vectors = (1 / reduction.rows.theta_scale, diagonal / reduction.scale, self.unit)
         per_theta, moved, unit = (x.contiguous().numpy() for x in vectors)
-        return kernels.Map(reduction.G.numpy(), reduction.V.numpy(), per_theta, moved, unit, of_theta, of_lam)
+        errors = of_theta, of_lam, reduction.rounding
+        return kernels.Map(reduction.G.numpy(), reduction.V.numpy(), per_theta, moved, unit, *errors)
 
     @cached_property
     def _per_unit(self) -> np.ndarray:

@@ -126,6 +126,7 @@ class Map:
         moved: what an error of the map is relative to for each unit of a multiplier, `(N,)`.
         unit: of the rows of v, powers of two, `(N,)`.
         error_of_theta, error_of_lam: bounds of the errors of the map, relative to both.
+        rounding: of each entry of G, relative to it, if multipliers meet no other error; else 0.
     """
 
     G: np.ndarray
@@ -135,12 +136,13 @@ class Map:
     unit: np.ndarray
     error_of_theta: float
     error_of_lam: float
+    rounding: float = 0.0
 
     @cached_property
     def arguments(self) -> tuple[Any, ...]:
         """The same, as the kernels read it."""
         arrays = (np.ascontiguousarray(x) for x in (self.G, self.V, self.per_theta, self.moved, self.unit))
-        return *arrays, self.error_of_theta, self.error_of_lam
+        return *arrays, self.error_of_theta, self.error_of_lam, self.rounding
 
 
 class PlannedArrays(NamedTuple):
