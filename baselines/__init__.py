@@ -23,6 +23,7 @@ from .forward_only import ENGINES, ForwardOnlyDPC
 from .full_kkt import FullKKT
 from .qplayer import QPLayerDPC
 from .qpth import QpthDPC
+from .robust import RobustDPC
 
 __all__ = [
     "FORMULATIONS",
@@ -35,6 +36,7 @@ __all__ = [
     "PeerInfo",
     "QPLayerDPC",
     "QpthDPC",
+    "RobustDPC",
 ]
 
 

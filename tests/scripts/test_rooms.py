@@ -8,7 +8,7 @@ import pytest
 
 from scripts.shared.command import ROOT
 
-ROOMS = {"adversary", "bench", "campaigns", "experiments", "regularization", "shared"}
+ROOMS = {"adversary", "bench", "campaigns", "defence", "experiments", "regularization", "shared"}
 FILES = sorted((ROOT / "scripts").rglob("*.py"))
 ENTRY_POINTS = sorted(path.stem for path in (ROOT / "scripts").glob("*.py") if path.stem != "__init__")
 

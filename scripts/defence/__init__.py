@@ -1,0 +1,1 @@
+"""What a defender measures: who is seen, and what poisoned recordings do."""
