@@ -28,7 +28,7 @@ from tqdm import tqdm
 from scripts.experiments.case import Case
 from scripts.experiments.masses import MovingMasses
 from scripts.experiments.quadrotor import Quadrotor
-from scripts.experiments.sensitivity import plan_gain, unexplained, with_noise, with_ridge
+from scripts.experiments.sensitivity import plan_gain, unexplained, with_noise
 from scripts.regularization.noise_report import ATTACKS, CLEAN, draw, report
 from scripts.shared.command import arguments, versions
 from scripts.shared.tables import Table, as_they_finish
@@ -56,7 +56,7 @@ def gains(plant: str, seed: int) -> list[dict[str, Any]]:
     add(CLEAN, 0.0, 0.0, plan_gain(case.layer(clean)))
     for size in SIZES:
         add("noise", size, size, plan_gain(case.layer(case.hankel(u, with_noise(y, size, seed)))))
-        add("ridge", size, 0.0, plan_gain(case.layer(with_ridge(clean, y, size))))
+        add("ridge", size, 0.0, plan_gain(case.layer(case.hankel(u, y, ridge=size))))
     for noise in NOISES:
         data = case.hankel(u, with_noise(y, noise, seed))
         for value in LAMBDAS["lambda_s"]:
@@ -74,8 +74,8 @@ def close_loop(plant: str, seed: int, kind: str, size: float) -> list[dict[str, 
     case, rows = CASES[plant], []
     with case.system() as system:
         u, y = case.record(system, seed)
-        data = case.hankel(u, with_noise(y, size, seed) if kind == "noise" else y)
-        data = with_ridge(data, y, size) if kind == "ridge" else data
+        recorded = with_noise(y, size, seed) if kind == "noise" else y
+        data = case.hankel(u, recorded, ridge=size if kind == "ridge" else 0.0)
         weights = case.paper()._replace(lambda_s=size) if kind == "lambda_s" else case.paper()
         layer = case.layer(data, weights)
         for attack in ATTACKS:

@@ -34,6 +34,7 @@ from scripts.shared.statistics import BAND, band
 from scripts.shared.tables import Table, as_they_finish
 
 COLUMNS = ("plant", "seed", "planner", "error", "last", "lost", "unsolved", "offset")
+NARROW = 3.0  # errors within this factor are drawn on a linear axis
 PLANNERS = {
     "paper": ("the paper's formulation", "#d55e00"),
     "affine": ("affine", "#0072b2"),
@@ -113,7 +114,11 @@ def plot(path: Path, rows: Sequence[dict[str, str]], seeds: int) -> None:
             axes.vlines(place, low, high, color=colour, linewidth=3, alpha=0.5)
             axes.plot(place, median, "o", color=colour, markersize=7)
             axes.plot(np.full(len(errors), place + 0.18), errors, ".", color=colour, markersize=3)
-        axes.set(title=case.name, yscale="log", ylabel=f"mean error [{case.unit}]", xlim=(-0.6, 3.6))
+        every = [values_of(rows, plant, planner, "error", seeds) for planner in PLANNERS]
+        scale = "log" if max(map(max, every)) > NARROW * min(map(min, every)) else "linear"
+        axes.set(title=case.name, yscale=scale, ylabel=f"mean error [{case.unit}]", xlim=(-0.6, 3.6))
+        if scale == "linear":
+            axes.set_ylim(bottom=0.0)
         axes.set_xticks(range(len(PLANNERS)), ["paper", "affine", "nearest", "model"], rotation=30)
     figure.suptitle(f"median and {BAND[0]}th to {BAND[1]}th percentile over {seeds} seeds")
     figure.savefig(path)

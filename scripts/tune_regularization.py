@@ -31,7 +31,6 @@ from tqdm import tqdm
 import torch_dpc as dpc
 from scripts.experiments.all_cases import CASES
 from scripts.experiments.case import Case, Weights
-from scripts.experiments.sensitivity import with_ridge
 from scripts.regularization.objectives import HELD_OUT_FROM, VALIDATION
 from scripts.regularization.picture import draw
 from scripts.regularization.report import HELD_OUT, RIDGE, VALIDATED, candidates, has_ridge, write_report
@@ -89,7 +88,7 @@ def run_points(
         u, y = case.record(plant, seed)
         data = case.hankel(u, y)
         for name, weights in points.items():
-            layer = case.layer(with_ridge(data, y, RIDGE_SIZE) if has_ridge(name) else data, weights)
+            layer = case.layer(data.with_ridge(RIDGE_SIZE * y.std(0)) if has_ridge(name) else data, weights)
             keys = {"case": case_name, "point": name, "split": split}
             rows += [keys | row for row in run_trials(case, plant, layer, seed, trials)]
     return rows

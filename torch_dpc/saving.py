@@ -120,6 +120,7 @@ _MATRICES = ("Up", "Uf", "Yp", "Yf")
 
 def _data_to_tree(data: HankelData, writer: _Writer) -> dict[str, Any]:
     tree: dict[str, Any] = {name: getattr(data, name) for name in _DATA_NUMBERS}
+    tree["n_ridge"] = data.n_ridge
     tree["recorded_as"] = None if data.recorded_as is None else str(data.recorded_as).removeprefix("torch.")
     for name in _MATRICES:
         matrix = getattr(data, name)
@@ -131,6 +132,7 @@ def _data_to_tree(data: HankelData, writer: _Writer) -> dict[str, Any]:
 
 def _data_from_tree(tree: Mapping[str, Any], reader: _Reader) -> HankelData:
     numbers = {name: tree[name] for name in _DATA_NUMBERS}
+    numbers["n_ridge"] = tree.get("n_ridge", 0)  # files of earlier versions have none
     matrices = {name: as_data(f"data.{name}", reader.tensors[f"data.{name}"]) for name in _MATRICES}
     columns = matrices["Up"].shape[-1]
     for name, matrix in matrices.items():

@@ -141,9 +141,9 @@ class Case:
         """Return the paper's weights."""
         return Weights(self.lambda_g, self.lambda_s, self.Q, self.R)
 
-    def hankel(self, u: Any, y: Any) -> dpc.HankelData:
-        """Return the data of one recording, or of a list of recordings."""
-        return dpc.HankelData.from_trajectories(u, y, t_ini=self.t_ini, horizon=self.horizon)
+    def hankel(self, u: Any, y: Any, *, ridge: float = 0.0) -> dpc.HankelData:
+        """Return the data of one recording, or of a list of recordings; a ridge is relative to each output's spread."""
+        return dpc.HankelData.from_trajectories(u, y, t_ini=self.t_ini, horizon=self.horizon, ridge=ridge)
 
     def data(self, plant: Any, seed: int) -> dpc.HankelData:
         """Return the data of the recording of a seed."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 
 import torch
 from torch import Tensor
@@ -23,28 +22,6 @@ def with_noise(y: Tensor, size: float, seed: int) -> Tensor:
     """Return recorded outputs `(T, n_y)` with noise of standard deviation size x that of each output."""
     generator = torch.Generator().manual_seed(NOISE_SEED + seed)
     return y + size * y.std(0) * torch.randn(y.shape, dtype=y.dtype, generator=generator)
-
-
-def with_ridge(data: dpc.HankelData, y: Tensor, size: float) -> dpc.HankelData:
-    """Return the data with one more window for each past output i: sqrt(n_g) size std(y_i) there, 0 elsewhere.
-
-    The problem depends on the recorded windows D through D D' alone. Independent noise of this size adds, on average,
-    n_g size^2 std(y_i)^2 to the diagonal of D D'; these windows add exactly that to the part of Yp.
-
-    Args:
-        data: of a recording.
-        y: its outputs, `(T, n_y)`.
-        size: relative to the standard deviation of each output.
-    """
-    if size == 0:
-        return data
-    entries = math.sqrt(data.n_g) * size * y.std(0).repeat(data.t_ini)
-
-    def wider(matrix: Tensor) -> Tensor:
-        return torch.cat([matrix, torch.zeros(len(matrix), len(entries), dtype=matrix.dtype)], dim=1)
-
-    Yp = torch.cat([data.Yp, torch.diag(entries)], dim=1)
-    return replace(data, Up=wider(data.Up), Yp=Yp, Uf=wider(data.Uf), Yf=wider(data.Yf))
 
 
 def unexplained(data: dpc.HankelData, y: Tensor) -> Tensor:

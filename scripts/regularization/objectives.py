@@ -21,7 +21,6 @@ import torch_dpc as dpc
 from scripts.experiments.case import Case, Weights
 from scripts.experiments.masses import Masses, MovingTarget
 from scripts.experiments.scenario import FIGURE, RANDOM_START, SCENARIOS
-from scripts.experiments.sensitivity import with_ridge
 from scripts.shared.statistics import NOMINAL, POISON
 from torch_dpc import tuning
 
@@ -78,7 +77,8 @@ def objectives(
         run = {"psi": _windows_target(case, starts), "predictor": predictor, "cost": tuning.MeanError(case.channels)}
         run |= {"plans": PLANS[case.plant], "replan_every": case.replan_every}
         budget = dpc.attacks.RelativeBall(case.rho)
-        objective = kind(case.layer(with_ridge(data, y, ridge), weights), windows, budget, **run, **options)
+        ridged = data.with_ridge(ridge * y.std(0)) if ridge else data
+        objective = kind(case.layer(ridged, weights), windows, budget, **run, **options)
         if isinstance(objective, GuardedObjective):
             paper = tuning.RobustObjective(case.layer(data), windows, budget, **run)
             with torch.no_grad():

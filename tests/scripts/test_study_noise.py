@@ -9,7 +9,7 @@ for package in ("matplotlib", "tqdm", "joblib"):
 
 from scripts import study_noise
 from scripts.experiments.masses import Masses
-from scripts.experiments.sensitivity import plan_gain, unexplained, with_noise, with_ridge
+from scripts.experiments.sensitivity import plan_gain, unexplained, with_noise
 
 MANY = 400  # draws of the noise that is averaged
 NEAR = 0.05  # relative: an entry of the mean of MANY noisy Gram matrices against what the ridge adds
@@ -40,7 +40,7 @@ def test_the_ridge_adds_what_noise_adds_on_average():
         D = torch.cat([data.Up, data.Yp, data.Uf, data.Yf])
         return D @ D.mT
 
-    added = gram(with_ridge(clean, y, size)) - gram(clean)
+    added = gram(case.hankel(u, y, ridge=size)) - gram(clean)
     expected = torch.zeros(len(added), dtype=torch.float64)
     expected[12:36] = clean.n_g * (size * y.std(0)).square().repeat(6)  # Yp, after 6 x 2 rows of Up
     torch.testing.assert_close(added, torch.diag(expected), rtol=1e-12, atol=1e-9)
@@ -52,7 +52,7 @@ def test_the_ridge_adds_what_noise_adds_on_average():
 def test_a_ridge_predicts_the_gain_of_noisy_recordings():
     case, u, y = recording(samples=None)  # the paper's 500 windows: with few of them the predictor fits the noise
     found = [plan_gain(case.layer(case.hankel(u, with_noise(y, 0.1, seed)))) for seed in range(20)]
-    assert plan_gain(case.layer(with_ridge(case.hankel(u, y), y, 0.1))) == pytest.approx(np.mean(found), rel=0.05)
+    assert plan_gain(case.layer(case.hankel(u, y, ridge=0.1))) == pytest.approx(np.mean(found), rel=0.05)
 
 
 def test_the_masses_have_as_many_directions_as_states():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import replace
 from typing import Any
 
@@ -51,11 +52,12 @@ class NearestWindows:
         data = layer.data
         if not isinstance(data, HankelData) or not data.has_windows:
             raise ValueError(f"`layer` must hold the recorded windows of one data set, got {data!r}.")
-        if check_count("k", k) > data.n_g:
-            raise ValueError(f"`k` must be at most the number of recorded windows, {data.n_g}, got {k}.")
+        if check_count("k", k) > data.n_windows:
+            raise ValueError(f"`k` must be at most the number of recorded windows, {data.n_windows}, got {k}.")
         self.layer, self.data, self.k = layer, data, k
         self.rounds = check_count("rounds", rounds)
         windows = torch.cat([m.detach().double() for m in (data.Up, data.Yp, data.Uf, data.Yf)])
+        windows = windows[:, : data.n_windows]
         self._units = _deviations(data, windows)
         self._windows = windows / self._units[:, None]
 
@@ -105,11 +107,13 @@ class NearestWindows:
 
     def _part(self, chosen: Tensor) -> HankelData:
         data = self.data
-        Up, Uf, Yp, Yf = (m[:, chosen] for m in (data.Up, data.Uf, data.Yp, data.Yf))
+        share = math.sqrt(self.k / data.n_windows)  # a ridge is that of the chosen windows
+        matrices = (data.Up, data.Uf, data.Yp, data.Yf)
+        Up, Uf, Yp, Yf = (torch.cat([m[:, chosen], share * m[:, data.n_windows :]], dim=1) for m in matrices)
         return replace(data, Up=Up, Uf=Uf, Yp=Yp, Yf=Yf)
 
     def __repr__(self) -> str:
-        return f"NearestWindows(k={self.k} of {self.data.n_g} windows, rounds={self.rounds})"
+        return f"NearestWindows(k={self.k} of {self.data.n_windows} windows, rounds={self.rounds})"
 
 
 def _deviations(data: HankelData, windows: Tensor) -> Tensor:

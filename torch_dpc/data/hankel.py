@@ -24,6 +24,7 @@ from ..checks import as_data, as_index, check_count, check_type
 from .csv import Source, read_csv
 from .rank import excitation_order, has_full_row_rank, relative_tolerance, warn_of_excitation
 from .recordings import as_recordings, hankel
+from .ridge import ridge_deviation, with_ridge_columns
 from .row_space import RowSpace
 from .window_factor import WindowFactor
 
@@ -45,6 +46,7 @@ class HankelData:
         windows_seen: None where each column is a recorded window. Otherwise the data are compact, and this is how many
             windows went into them (:meth:`from_stream`, :meth:`compressed`).
         recorded_as: the precision of the recordings; None for that of the matrices. It sets the rank tolerance.
+        n_ridge: how many of the last columns are a ridge and no windows (:meth:`with_ridge`).
 
     The rows are time-major and each column is one window. The matrices are constants of the problem: replace
     the object rather than edit them. A graph behind the trajectories is kept, so the data can be differentiated.
@@ -70,6 +72,7 @@ class HankelData:
     n_y: int
     windows_seen: int | None = None
     recorded_as: torch.dtype | None = None
+    n_ridge: int = 0
 
     def __post_init__(self) -> None:
         sizes = {name: check_count(name, getattr(self, name)) for name in ("t_ini", "horizon", "n_u", "n_y")}
@@ -81,14 +84,15 @@ class HankelData:
             check_type(name, matrix, Tensor)
             as_data(name, matrix)
             steps, channels = ("t_ini" if name[1] == "p" else "horizon"), f"n_{name[0].lower()}"
-            if name == "Up" and self.has_ones and (self.windows_seen is not None or bool((matrix[0] == 1).all())):
+            may_have_ones = name == "Up" and self.has_ones
+            if may_have_ones and (self.windows_seen is not None or bool((matrix[0] == self._ones).all())):
                 matrix = matrix[1:]  # the row of ones of `with_ones`
             if matrix.shape != (sizes[steps] * sizes[channels], columns):
                 wanted = f"({steps} {channels}, n_g) = ({sizes[steps] * sizes[channels]}, {columns})"
                 raise ValueError(f"`{name}` must have shape {wanted}, got {tuple(matrix.shape)}.")
 
     @classmethod
-    def from_trajectories(cls, u: Any, y: Any, *, t_ini: int, horizon: int) -> HankelData:
+    def from_trajectories(cls, u: Any, y: Any, *, t_ini: int, horizon: int, ridge: Any = 0.0) -> HankelData:
         """Build the matrices from one recording, or from a list of recordings.
 
         Args:
@@ -96,6 +100,8 @@ class HankelData:
             y: outputs, `(T, n_y)`, or a list of such, as long as their inputs.
             t_ini: steps that fix the initial condition (the paper's sigma).
             horizon: steps that are planned.
+            ridge: as if the recorded outputs had noise of this size, relative to the standard deviation of each
+                output: :meth:`with_ridge`; a number or `(n_y,)`.
 
         Raises:
             ValueError: shapes that do not fit, samples that are not finite, or a recording shorter than one window.
@@ -119,7 +125,10 @@ class HankelData:
             order = excitation_order([recording.detach() for recording in u_list])
             warn_of_excitation(order, depth, U.shape[1], n_u, stacklevel=2)
         cut_u, cut_y = t_ini * n_u, t_ini * n_y
-        return cls(U[:cut_u], U[cut_u:], Y[:cut_y], Y[cut_y:], t_ini, horizon, n_u, n_y)
+        data = cls(U[:cut_u], U[cut_u:], Y[:cut_y], Y[cut_y:], t_ini, horizon, n_u, n_y)
+        if isinstance(ridge, (int, float)) and ridge == 0:
+            return data
+        return data.with_ridge(ridge_deviation("ridge", ridge, n_y) * torch.cat(y_list).std(dim=0))
 
     @classmethod
     def from_csv(
@@ -131,6 +140,7 @@ class HankelData:
         t_ini: int,
         horizon: int,
         delimiter: str = ",",
+        ridge: Any = 0.0,
     ) -> HankelData:
         """Build the matrices from a CSV file, or from a list of files, each a recording of its own.
 
@@ -140,6 +150,7 @@ class HankelData:
             t_ini: steps that fix the initial condition.
             horizon: steps that are planned.
             delimiter: between columns.
+            ridge: as for :meth:`from_trajectories`.
 
         Raises:
             ValueError: a missing column, a line of another length, an entry that is no finite number (each with the
@@ -154,7 +165,7 @@ class HankelData:
             raise ValueError("`path` must be a file or a list of one file or more, got an empty list.")
         recordings = [read_csv(one, inputs, outputs, delimiter=delimiter) for one in paths]
         u, y = map(list, zip(*recordings, strict=True))
-        return cls.from_trajectories(u, y, t_ini=t_ini, horizon=horizon)
+        return cls.from_trajectories(u, y, t_ini=t_ini, horizon=horizon, ridge=ridge)
 
     @classmethod
     def from_stream(cls, chunks: Iterable[Any], *, t_ini: int, horizon: int) -> HankelData:
@@ -204,7 +215,7 @@ class HankelData:
 
     @property
     def n_g(self) -> int:
-        """The columns of the matrices: the number of windows, unless the data are compact."""
+        """The columns of the matrices: the windows and those of a ridge, unless the data are compact."""
         return self.Up.shape[-1]
 
     @property
@@ -220,7 +231,7 @@ class HankelData:
     @property
     def n_windows(self) -> int:
         """The number of recorded windows that are in the data."""
-        return self.n_g if self.windows_seen is None else self.windows_seen
+        return self.n_g - self.n_ridge if self.windows_seen is None else self.windows_seen
 
     def require_windows(self) -> None:
         """Raise ValueError where the data are compact, for `g` weighs the recorded windows."""
@@ -255,7 +266,35 @@ class HankelData:
                 "`affine=True` needs the recorded windows, and these data are compact: build the layer on "
                 "HankelData.from_trajectories."
             )
-        return replace(self, Up=torch.cat([self.Up.new_ones(1, self.n_g), self.Up]))
+        return replace(self, Up=torch.cat([self._ones[None], self.Up]))
+
+    @property
+    def _ones(self) -> Tensor:
+        """1 for every window and 0 for the columns of a ridge, which stands for noise of mean zero, `(n_g,)`."""
+        return (torch.arange(self.n_g, device=self.Up.device) < self.n_g - self.n_ridge).to(self.Up.dtype)
+
+    def with_ridge(self, deviation: Any) -> HankelData:
+        """Return the data as if the recorded outputs had independent noise, on average, in the past of the windows.
+
+        What noise of standard deviation s_i on output i adds on average to D D', n_windows s_i^2 on the diagonal, is
+        added to the part of Yp exactly, by t_ini n_y columns that stand after the windows. A plan then trusts a
+        direction of the measured past only as far as the recording shows it above that noise. `g` has entries for these
+        columns.
+
+        Args:
+            deviation: s, in the units of the outputs, a number or `(n_y,)`; its graph is kept.
+
+        Raises:
+            ValueError: another shape, or an entry that is negative or not finite.
+
+        Example:
+            >>> u, y = torch.rand(40, 1, dtype=torch.float64), torch.rand(40, 2, dtype=torch.float64)
+            >>> data = HankelData.from_trajectories(u, y, t_ini=2, horizon=5)
+            >>> data.with_ridge(0.01).n_g, data.with_ridge(0.01).n_windows
+            (38, 34)
+        """
+        Up, Uf, Yp, Yf = with_ridge_columns(self, ridge_deviation("deviation", deviation, self.n_y))
+        return replace(self, Up=Up, Uf=Uf, Yp=Yp, Yf=Yf, n_ridge=self.n_ridge + self.t_ini * self.n_y)
 
     def compressed(self) -> HankelData:
         """Return the same data as `rank` columns, whatever the number of windows; plans are the same to the last bit.
@@ -272,8 +311,9 @@ class HankelData:
         rows = self.stacked @ self.basis
         Up, Yp, Uf, Yf = rows.split([len(m) for m in self.matrices])
         compact = replace(
-            self, Up=Up, Uf=Uf, Yp=Yp, Yf=Yf, windows_seen=self.n_windows, recorded_as=self.recorded_as or self.Up.dtype
-        )
+            self, Up=Up, Uf=Uf, Yp=Yp, Yf=Yf, windows_seen=self.n_windows, n_ridge=0,
+            recorded_as=self.recorded_as or self.Up.dtype,
+        )  # fmt: skip
         compact.__dict__["row_space"] = self.row_space.of_its_coordinates()
         return compact
 
@@ -330,6 +370,7 @@ class HankelData:
     def __repr__(self) -> str:
         space = self.row_space
         compact = "" if self.has_windows else f" (compact, of {self.n_windows} windows)"
+        compact += f" ({self.n_ridge} of a ridge)" if self.n_ridge else ""
         return (
             f"HankelData(n_u={self.n_u}, n_y={self.n_y}, t_ini={self.t_ini}, horizon={self.horizon}, n_g={self.n_g}"
             f"{compact}, rank={space.rank} of {space.n_rows} rows, singular values {space.last_kept:.1e} kept / "
