@@ -26,6 +26,9 @@ from .solve.engines import Sets
 from .solve.recovery import Recovery
 from .tracing import batches_of, described, flat_parameters, planned_by_operator
 
+ARGUMENTS = ("Q", "R", "lambda_g", "lambda_s", "u_set", "y_set", "du_set", "R_du", "lambda_u", "regularizer", "beta_2")
+ARGUMENTS += ("slack_set", "terminal_steps", "affine", "Q_terminal", "solver", "on_failure")  # of the constructor
+
 
 class DPCLayer(ConfiguredModule):
     """Plan a trajectory of the recorded system by one quadratic program, differentiably.
@@ -263,26 +266,7 @@ class DPCLayer(ConfiguredModule):
 
     def config(self) -> dict[str, Any]:
         """Return the arguments of the constructor beyond the data, as they are now."""
-        return {
-            "Q": self.Q,
-            "R": self.R,
-            "lambda_g": self.lambda_g,
-            "lambda_s": self.lambda_s,
-            "u_set": self.u_set,
-            "y_set": self.y_set,
-            "du_set": self.du_set,
-            "R_du": self.R_du,
-            "lambda_u": self.lambda_u,
-            "regularizer": self.regularizer,
-            "beta_2": self.beta_2,
-            "slack_set": self.slack_set,
-            "terminal_steps": self.terminal_steps,
-            "affine": self.affine,
-            "Q_terminal": self.Q_terminal,
-            "backward": self.backward_system,
-            "solver": self.solver,
-            "on_failure": self.on_failure,
-        }
+        return {name: getattr(self, name) for name in ARGUMENTS} | {"backward": self.backward_system}
 
     def save(self, path: str | os.PathLike[str], *, data: bool = False) -> None:
         """Write the layer to a safetensors file: weights, sets, settings and the data, without pickle.

@@ -304,7 +304,7 @@ def test_a_missing_package_says_how_to_get_it(make, module, monkeypatch, gentle_
     if make is CvxpyLayersDPC:
         pytest.importorskip("cvxpy")
     monkeypatch.setitem(sys.modules, module, None)
-    with pytest.raises(ImportError, match=r"pip install torch_dpc\[baselines\]") as caught:
+    with pytest.raises(ImportError, match=r"pip install 'torch_dpc\[baselines\]'") as caught:
         make(gentle_layer)
     assert ("--no-deps" in str(caught.value)) == (make is QpthDPC)
 

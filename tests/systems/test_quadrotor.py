@@ -5,6 +5,7 @@ import math
 import pickle
 import subprocess
 import sys
+from collections import namedtuple
 
 import numpy as np
 import pytest
@@ -343,9 +344,14 @@ def test_bad_arguments_are_refused(plant):
             Quadrotor(physics_hz=physics_hz)
 
 
-def test_missing_pybullet_gives_the_install_hint(monkeypatch):
+@pytest.mark.parametrize(
+    ("python", "hint"),
+    [((3, 11), r"pip install 'torch_dpc\[quadrotor\]'"), ((3, 13), r"up to Python 3\.11, .*TorchQuadrotor")],
+)
+def test_missing_pybullet_gives_the_install_hint(monkeypatch, python, hint):
     monkeypatch.setitem(sys.modules, "pybullet", None)
-    with pytest.raises(ImportError, match=r"pip install torch_dpc\[quadrotor\].*only up to Python 3\.11"):
+    with monkeypatch.context() as context, pytest.raises(ImportError, match=hint):
+        context.setattr(sys, "version_info", namedtuple("Version", "major minor")(*python))
         Quadrotor()
 
 

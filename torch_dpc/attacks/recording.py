@@ -48,7 +48,7 @@ class Poisoned(Described):
     Attributes:
         y: the poisoned outputs, as they came: `(T, n_y)`, or a list of such.
         p: what was added, `(T, n_y)`, the recordings of a list one after another.
-        samples: the rows of p that are not zero, in the order in which they were chosen, `(k,)`.
+        samples: the rows of p that may differ from zero, in the order in which they were chosen, `(k,)`.
         layer: the layer that plans with the poisoned recording.
         before, after: mean psi with the clean and with the poisoned recording.
     """
@@ -115,6 +115,10 @@ class PoisonedRecording(Described):
             raise ValueError(f"{rule}, got {steps!r}.")
         self.layer, self.cost, self.budget, self.choose, self.steps = layer, cost, budget, choose, steps
         self.samples: int | list[int] = _samples(samples)
+
+    def __repr__(self) -> str:
+        rest = f"samples={self.samples}, choose={self.choose!r}, steps={self.steps}"
+        return f"PoisonedRecording({self.cost!r}, {self.budget!r}, {rest})"
 
     def __call__(
         self,
