@@ -26,8 +26,10 @@ from .solve.engines import Sets
 from .solve.recovery import Recovery
 from .tracing import batches_of, described, flat_parameters, planned_by_operator
 
-ARGUMENTS = ("Q", "R", "lambda_g", "lambda_s", "u_set", "y_set", "du_set", "R_du", "lambda_u", "regularizer", "beta_2")
-ARGUMENTS += ("slack_set", "terminal_steps", "affine", "Q_terminal", "solver", "on_failure")  # of the constructor
+ARGUMENTS = (  # of the constructor, by the names under which the layer keeps them
+    *("Q", "R", "lambda_g", "lambda_s", "u_set", "y_set", "du_set", "R_du", "lambda_u", "regularizer", "beta_2"),
+    *("slack_set", "terminal_steps", "affine", "Q_terminal", "solver", "on_failure"),
+)
 
 
 class DPCLayer(ConfiguredModule):
@@ -258,10 +260,9 @@ class DPCLayer(ConfiguredModule):
         data = self._setup.data
         if weights.are_batched or isinstance(data, HankelBatch):
             raise ValueError("`compact_form` takes one problem; the weights or the data have a batch dimension.")
-        if self.du_set is not None:
-            raise ValueError("`compact_form` has no rows for changes of the input; leave out `du_set`.")
-        if self.slack_set is not None:
-            raise ValueError("`compact_form` has no rows for Yp g - y_ini; leave out `slack_set`.")
+        for name, rows in (("du_set", "changes of the input"), ("slack_set", "Yp g - y_ini")):
+            if getattr(self, name) is not None:
+                raise ValueError(f"`compact_form` has no rows for {rows}; leave out `{name}`.")
         return compact_form(data, weights, theta, self.terms)
 
     def config(self) -> dict[str, Any]:
@@ -296,5 +297,4 @@ class DPCLayer(ConfiguredModule):
             ValueError: a damaged file, another version of the format, or a set that is not known.
             ImportError: safetensors is missing.
         """
-        layer: DPCLayer = load_layer(cls, path)
-        return layer
+        return load_layer(cls, path)
