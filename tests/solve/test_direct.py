@@ -21,6 +21,7 @@ SETS = {
     "soft": {"u_set": dpc.Box(-0.5, 0.5), "y_set": dpc.SoftBox(-0.2, 0.2, 3.0)},
     "rates": {"u_set": dpc.Box(-0.5, 0.5), "R_du": 0.3, "du_set": dpc.Box(-0.4, 0.4)},
     "affine": {"u_set": dpc.Box(-0.5, 0.5), "affine": True},
+    "slack": {"slack_set": dpc.SoftBox(0.0, 0.0, 2.0)},
     "free": {},
 }
 
@@ -72,7 +73,7 @@ def test_plans_and_gradients_are_those_of_a_batch_of_one(name, counted):
 
 
 @built
-@pytest.mark.parametrize("name", ["box", "ball", "soft", "rates", "affine"])
+@pytest.mark.parametrize("name", ["box", "ball", "soft", "rates", "affine", "slack"])
 def test_derivatives_of_both_orders(name, counted):
     layer = small_layer(**{"u_set": None, **SETS[name]})
 

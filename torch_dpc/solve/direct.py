@@ -128,7 +128,7 @@ class Direct:
 
         Args:
             saved: lam, active, info; then u, y, du and weak for sets that are no boxes.
-            bars: cotangents of u, y, du and lam, each of which may be None.
+            bars: cotangents of u, y, what follows them in v, and lam, each of which may be None.
         """
         lam, active = saved[0].detach().numpy(), saved[1].numpy()
         v, weak = lam, active  # for boxes they do not count
@@ -136,7 +136,7 @@ class Direct:
             v, weak = np.concatenate([x.detach().numpy().ravel() for x in saved[3:6]]), saved[6].numpy()
         sizes, kept = self.solver.sizes, []
         addresses: Addresses = ()
-        for bar, size in zip(bars, (sizes.u, sizes.y, sizes.du, sizes.v), strict=True):
+        for bar, size in zip(bars, (sizes.u, sizes.y, sizes.more, sizes.v), strict=True):
             given = size
             if bar is not None and (bar.is_neg() or not bar.is_contiguous()):
                 if any(bar.stride()) or bar.is_neg():
