@@ -83,6 +83,21 @@ def test_weights_under_adam_stay_in_their_domain():
         tuning.Semidefinite().right_inverse(-torch.eye(2))
 
 
+def test_the_error_names_what_keeps_a_learned_weight_in_its_domain():
+    u_ini, y_ini = torch.zeros(4, 2).double(), torch.zeros(4, 4).double()
+    for name, start, bad, remedy in (
+        ("lambda_s", torch.tensor(1.0), torch.tensor(-1.0), "tuning.Positive"),
+        ("Q", torch.eye(4), -torch.eye(4), "tuning.Semidefinite"),
+    ):
+        planner = layer(**{name: torch.nn.Parameter(start.double())})
+        with torch.no_grad():
+            getattr(planner, name).copy_(bad)
+        with pytest.raises(ValueError, match=rf"`{name}` must .* stays in its domain with {remedy}"):
+            planner(u_ini, y_ini)
+    with pytest.raises(ValueError, match=r"`lambda_s` must not be negative, got -1\.$"):
+        layer(lambda_s=-1.0)
+
+
 # --- every attack, every recording ------------------------------------------------------------------------------------
 
 COST, BUDGET = attacks.TargetInput(torch.zeros(2)), attacks.RelativeBall(0.1)

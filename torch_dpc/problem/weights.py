@@ -90,7 +90,7 @@ def weight_matrix(name: str, value: Any, channels: int, horizon: int) -> Tensor:
         if smallest < -NEGATIVE_EIGENVALUE:
             raise ValueError(
                 f"`{name}` must be positive semidefinite, got an eigenvalue of {float(smallest):.1e} (channels brought "
-                f"to a unit diagonal)."
+                f"to a unit diagonal).{_hint('Semidefinite', matrix)}"
             )
     matrix = (matrix + transposed) / 2
     if matrix.shape[-1] == size:
@@ -133,8 +133,16 @@ def penalty(name: str, value: Any) -> Tensor:
     """
     number = as_weight(name, value)
     if bool((number.detach() < 0).any()):
-        raise ValueError(f"`{name}` must not be negative, got {float(number.detach().min()):g}.")
+        least = float(number.detach().min())
+        raise ValueError(f"`{name}` must not be negative, got {least:g}.{_hint('Positive', number)}")
     return number
+
+
+def _hint(parametrisation: str, weight: Tensor) -> str:
+    """Return how a weight that learns is kept in its domain; nothing for one that does not learn."""
+    if not weight.requires_grad:
+        return ""
+    return f" A weight that learns stays in its domain with tuning.{parametrisation}, by torch.nn.utils.parametrize."
 
 
 def as_weight(name: str, value: Any) -> Tensor:
