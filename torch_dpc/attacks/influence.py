@@ -37,7 +37,8 @@ def weigh_windows(data: HankelData, weights: Any) -> HankelData:
         >>> weights = torch.ones(data.n_g, dtype=torch.float64)
         >>> weights[3] = 0.0                                       # the plans of the other windows
         >>> weigh_windows(data, weights)
-        HankelData(n_u=1, n_y=2, t_ini=2, horizon=5, n_g=34 (compact, of 34 windows), rank=21 of 21 rows, ...
+        HankelData(n_u=1, n_y=2, t_ini=2, horizon=5, n_g=34 (compact, of 34 windows),
+            rank=21 of 21 rows, ...
     """
     check_type("data", data, HankelData)
     if not data.has_windows:

@@ -373,6 +373,6 @@ class HankelData:
         compact += f" ({self.n_ridge} of a ridge)" if self.n_ridge else ""
         return (
             f"HankelData(n_u={self.n_u}, n_y={self.n_y}, t_ini={self.t_ini}, horizon={self.horizon}, n_g={self.n_g}"
-            f"{compact}, rank={space.rank} of {space.n_rows} rows, singular values {space.last_kept:.1e} kept / "
+            f"{compact},\n    rank={space.rank} of {space.n_rows} rows, singular values {space.last_kept:.1e} kept / "
             f"{space.first_dropped:.1e} dropped, relative to the largest)"
         )
