@@ -135,6 +135,20 @@ def test_what_the_direct_way_leaves_to_the_general_one(counted):
 
 
 @built
+def test_a_plan_that_is_not_vouched_for_is_solved_generally(monkeypatch):
+    layer = small_layer(u_set=dpc.Ball(0.4))
+    expected, asked = planned(layer, leaves()).u, []
+
+    def doubts(_, theta, lam, v):
+        asked.append(theta)
+        return torch.zeros(theta.shape[:-1], dtype=torch.bool)
+
+    monkeypatch.setattr(type(layer.factored(torch.device("cpu")).solver.screen), "vouches", doubts)
+    assert relative(planned(layer, leaves()).u, expected) < 1e-9
+    assert len(asked) > 1  # by the direct way, and by the general one
+
+
+@built
 def test_windows_may_change_after_the_plan(counted):
     layer = small_layer(u_set=dpc.Box(-0.5, 0.5))
     window, leaf = u_ini.clone(), y_ini.clone().requires_grad_()

@@ -86,7 +86,7 @@ class Direct:
     def of(solver: Solver, sets: Sets, shapes: Shapes) -> Direct | None:
         """Return the direct way of a problem; None if the kernel does not take it as a whole."""
         planner = solver.compiled
-        if planner is None or solver.engine == "daqp" or solver.full is not None:
+        if planner is None or solver.engine == "daqp" or solver.full is not None or not solver.is_clear:
             return None
         arrays = planner.arrays(sets, torch.Size(), torch.device("cpu"))
         if arrays is None or any(x.ndim > 1 for x in arrays if x is not None):
@@ -116,6 +116,8 @@ class Direct:
         found = window_kernels.plan_one(self.planner.map, self.arrays, self._before + addresses)
         theta, v, lam, active, weak, info, convinces = found
         joined = torch.from_numpy(theta)
+        if convinces and not self.sets.is_box:
+            convinces = bool(self.solver.screen.vouches(joined, torch.from_numpy(lam), torch.from_numpy(v)))
         if not convinces:
             return joined, self.solver.solve(joined, self.sets, on_failure)
         parts = [*self.solver.sizes.split(v), lam, active, info]
