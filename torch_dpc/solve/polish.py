@@ -63,7 +63,8 @@ def polished(program: ConeProgram, point: Point) -> Point:
         tail = p.B[held.shells, 1:]
         along = (n[:, :, None] * tail).sum(axis=1)
         across = tail - n[:, :, None] * along[:, None, :]
-        bent = (np.sqrt(np.maximum(nu, 0) / length)[:, None, None] * across).reshape(tail[..., 0].size, len(y))
+        bent = np.sqrt(np.maximum(nu, 0) / length)[:, None, None] * across
+        bent = bent.reshape(tail.shape[0] * tail.shape[1], len(y))
         at_tips = p.B[held.tips].reshape(p.b[held.tips].size, len(y))
         J = np.concatenate([p.G[held.rows], p.B[held.shells, 0] - along, at_tips])
         missed = np.concatenate([(p.G @ y - p.h)[held.rows], length - s[:, 0], -(p.b - p.B @ y)[held.tips].ravel()])
