@@ -15,11 +15,12 @@ from .budgets import (
     StealthyBudget,
 )
 from .certificate import SensitivityBound, sensitivity_bound
-from .costs import Cost, TargetInput, TrackingError
+from .costs import BoundViolation, Cost, TargetInput, TrackingError
 from .ensemble import Ensemble
-from .exact import WorstCase, worst_case
+from .exact import CertifiedInterval, WorstCase, certified_interval, worst_case
 from .gradient import FrankWolfeAttack, LinearizedAttack, ProjectedGradientAttack
 from .influence import weigh_windows, window_influence
+from .on_signal import AttackOn
 from .policy import AttackPolicy, PolicyAttack
 from .query import FiniteDifferenceAttack, RandomSearchAttack
 from .random import RandomAttack
@@ -34,12 +35,15 @@ RelativeBall, SparseBall, Stealthy = RelativeBallBudget, SparseBallBudget, Steal
 
 __all__ = [
     "Attack",
+    "AttackOn",
     "AttackPolicy",
     "Ball",
     "BallBudget",
+    "BoundViolation",
     "Box",
     "BoxBudget",
     "Budget",
+    "CertifiedInterval",
     "Cost",
     "Ellipsoid",
     "EllipsoidBudget",
@@ -73,6 +77,7 @@ __all__ = [
     "TargetInput",
     "TrackingError",
     "WorstCase",
+    "certified_interval",
     "robustness_curve",
     "sensitivity_bound",
     "weigh_windows",

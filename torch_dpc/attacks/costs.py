@@ -132,6 +132,45 @@ class TrackingError(Described):
         )
 
 
+class BoundViolation:
+    """psi = -(sum of what the planned outputs exceed bounds by): take the controller's plan away.
+
+    A problem with hard bounds has no violation; it has no plan. So give the attack a surrogate of the controller whose
+    outputs have a soft box (:class:`torch_dpc.SoftBox`) of a high price: it leaves the box only where it must, and
+    there the same problem with hard bounds is infeasible. Bounds of the cost that are narrower than the box lead there.
+    y_ini enters the cost of a plan and none of its constraints: only an attack on u_ini
+    (:class:`torch_dpc.attacks.AttackOn`) can take the plan away.
+
+    Args:
+        lower, upper: of the outputs, a number, `(n_y,)` or `(horizon, n_y)`, in their units.
+
+    Example:
+        >>> import torch_dpc as dpc
+        >>> plant, generator = dpc.systems.OscillatingMasses(), torch.Generator().manual_seed(0)
+        >>> u, y = dpc.collect(plant, 120, generator=generator)
+        >>> data = dpc.HankelData.from_trajectories(u, y, t_ini=4, horizon=10)
+        >>> soft = dpc.SoftBox(-0.2, 0.2, weight=1e3)
+        >>> layer = dpc.DPCLayer(data, Q=10.0, R=1.0, lambda_g=1.0, lambda_s=1e4, y_set=soft)
+        >>> cost = BoundViolation(-0.1, 0.1)
+        >>> p = dpc.attacks.LinearizedAttack(layer, cost, dpc.BallBudget(0.1))(u[:4], y[:4])
+        >>> bool(cost(layer(u[:4], y[:4] + p)) < cost(layer(u[:4], y[:4])))
+        True
+    """
+
+    def __init__(self, lower: Any, upper: Any):
+        self.lower, self.upper = as_data("lower", lower), as_data("upper", upper)
+        if not bool((self.lower <= self.upper).all()):
+            raise ValueError(f"`lower` must be at most `upper`, got {lower!r} and {upper!r}.")
+
+    def __call__(self, solution: DPCSolution) -> Tensor:
+        """Return psi, `(*batch,)`."""
+        if not hasattr(solution, "y"):
+            raise ValueError("`BoundViolation` needs the planned outputs: give the attack a DPCLayer.")
+        above = (solution.y - self.upper.to(solution.y)).clamp_min(0.0)
+        below = (self.lower.to(solution.y) - solution.y).clamp_min(0.0)
+        return -(above + below).sum((-2, -1))
+
+
 def check_cost(cost: Any, name: str = "cost") -> None:
     """Raise ValueError unless a cost can be called, or made callable for a step or a window."""
     if isinstance(cost, type) or not (callable(cost) or hasattr(cost, "at") or hasattr(cost, "given")):

@@ -103,7 +103,6 @@ class Loop:
         self.y = self.port.step(u)
         return u
 
-
     @staticmethod
     def _checked(p: Any, y_ini: Tensor) -> Tensor:
         """Return what an attack adds, which a callable of one's own may have wrong."""

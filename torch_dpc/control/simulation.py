@@ -108,6 +108,8 @@ def simulate(
     controller.reset()
     if isinstance(attack, str) or not isinstance(attack, Sequence):
         check_callable("attack", attack, optional=True)
+        if (on := getattr(attack, "on", "y_ini")) != "y_ini":
+            raise ValueError(f"`attack` must be an attack on y_ini, got one on {on}.")
     else:
         attack = side_by_side(attack)
     if detector is not None:

@@ -67,9 +67,7 @@ def animate(
     return path
 
 
-def _panels(
-    log: Any, layer: Any, y_names: Sequence[str] | None, u_names: Sequence[str] | None
-) -> tuple[Figure, Any]:
+def _panels(log: Any, layer: Any, y_names: Sequence[str] | None, u_names: Sequence[str] | None) -> tuple[Figure, Any]:
     """Return the figure of the whole run, and what covers the steps that are still to come."""
     figure = draw_log(log, layer=layer, y_names=y_names, u_names=u_names)
     t = as_array(log.t)

@@ -153,8 +153,9 @@ class Rows:
         lower, upper = (bound[index] for bound in bounds)
         v, lam = (x[index] for x in nominal)
         values, vectors = np.linalg.eigh(G)
-        independent = values[0] > DEPENDENT * values[-1]
-        root = vectors / np.sqrt(np.where(values > DEPENDENT * values[-1], values, np.inf))
+        seen = values > DEPENDENT * values.max(initial=0.0)
+        independent = bool(seen.all())
+        root = vectors / np.sqrt(np.where(seen, values, np.inf))
         X = root.T @ A
         R = float(np.linalg.norm(budget.most(X)))
         if len(budget.pieces) == 1:

@@ -12,17 +12,19 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from ... import plot
-from ...checks import as_data, check_number, check_type
+from ...checks import as_data, check_number
 from ...errors import Status
 from ...layer import DPCLayer
-from ..base import within_budget
 from ..budgets import Budget
 from ..costs import TargetInput
 from ..gradient import ProjectedGradientAttack
-from .complementarity import Array, Budgeted, Rows, in_few_variables
-from .relaxation import Quadratic
+from .complementarity import FREE, Array, Rows, allowed_states
+from .moments import Moments
+from .relaxation import DUAL_SLACK, Quadratic
 from .search import Search, search
+from .shrink import shrink
 from .tighten import others_that_reach, tighten
+from .window import Window, check_problem
 
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
@@ -36,7 +38,10 @@ class ExactSettings:
     steps: int = 30  # of each
     samples: int = 200  # random perturbations that show which rows reach their bounds
     rounds: int = 2  # of interval tightening
-    share: float = 0.5  # of the time limit that tightening may take
+    share: float = 0.5  # of the time limit that each kind of tightening may take
+    moment_rounds: int = 3  # of caps by channel, each followed by a bound
+    progress: float = 0.02  # of the gap that a round must close for another one
+    precision: float = 0.1  # of the tolerance, to which a moment relaxation is solved
 
 
 SETTINGS = ExactSettings()
@@ -99,11 +104,12 @@ def worst_case(
     """Minimise psi(u*(p)) = 1/2 |u*(p) - u_target|^2 over the budget, with a proven lower bound.
 
     The plan is the solution of a complementarity system (:mod:`torch_dpc.attacks.exact.complementarity`), psi is convex
-    in its variables, and what is not convex is which row is at which bound. Branch and bound decides that: a node
-    leaves some rows undecided and relaxes them to the convex hull of their states. The intervals that the hull needs
-    come from the nonexpansiveness of the projection and from convex programs over the budget; there is no big M to
-    guess. Rows that cannot reach a bound carry no decision. Perturbations that leave the controller without a plan have
-    no psi and are left out.
+    in its variables, and what is not convex is which row is at which bound. A moment relaxation bounds psi over all
+    active sets at once (:mod:`torch_dpc.attacks.exact.moments`). What it leaves open is decided by branch and bound: a
+    node leaves some rows undecided and relaxes them to the convex hull of their states. Intervals and multiplier bounds
+    come from the nonexpansiveness of the projection and from programs over the budget; there is no big M to guess. Rows
+    that cannot reach a bound carry no decision. Perturbations that leave the controller without a plan have no psi and
+    are left out.
 
     Args:
         layer: the controller's layer; its sets are boxes, and it is one problem, not a batch of weights.
@@ -137,10 +143,7 @@ def worst_case(
         raise ImportError("`worst_case` needs Clarabel: pip install 'torch_dpc[exact]'.") from error
     if not isinstance(cost, TargetInput):
         raise ValueError(f"`cost` must be a TargetInput, whose psi is convex in the plan, got {type(cost).__name__}.")
-    check_type("layer", layer, DPCLayer)
-    check_type("budget", budget, Budget)
-    if not layer.has_bounds:
-        raise ValueError("`layer` must have boxes as its sets: curved sets have more than three states a row.")
+    check_problem(layer, budget)
     check_number("time_limit", time_limit, positive=True, finite=False)
     if not check_number("tolerance", tolerance, kind="at least 1e-6 and finite") >= 1e-6:
         raise ValueError(f"`tolerance` must be at least 1e-6, got {tolerance!r}.")
@@ -148,7 +151,7 @@ def worst_case(
     theta, _ = layer.flatten(u_ini, y_ini, y_ref, u_ref)
     batch = theta.shape[:-1]
     flat = theta.reshape(-1, theta.shape[-1]).detach()
-    results = [_Window(layer, cost, budget, one, step, time_limit, tolerance).solve() for one in flat]
+    results = [_Proof(Window(layer, budget, one), cost, step, time_limit, tolerance).solve() for one in flat]
     p = torch.stack([result[0] for result in results]) if results else y_ini.new_zeros(0, *y_ini.shape[-2:])
     columns = torch.tensor([result[1] for result in results], dtype=torch.float64).reshape(-1, 5)
     value, bound, nominal, nodes, seconds = (column.reshape(batch) for column in columns.unbind(1))
@@ -166,108 +169,126 @@ def worst_case(
     )
 
 
-class _Window:
+class _Proof:
     """The search of one window."""
 
-    def __init__(
-        self,
-        layer: DPCLayer,
-        cost: TargetInput,
-        budget: Budget,
-        theta: Tensor,
-        step: int,
-        time_limit: float,
-        tolerance: float,
-    ):
+    def __init__(self, window: Window, cost: TargetInput, step: int, time_limit: float, tolerance: float):
         self.began = time.monotonic()
         self.deadline = self.began + time_limit
-        self.tighten_until = self.began + SETTINGS.share * time_limit
-        data = layer.data
-        sizes = [n * data.t_ini for n in (data.n_u, data.n_y)] + [n * data.horizon for n in (data.n_u, data.n_y)]
-        u_ini, y_ini, u_ref, y_ref = theta.split(sizes)
-        u_of_window = theta[: data.t_ini * data.n_u].reshape(-1, data.n_u)
-        budget = budget.given(u_of_window)
-        self.layer, self.cost, self.budget, self.step, self.tolerance = layer, cost, budget, step, tolerance
-        self.u_ini, self.y_ini = u_ini.reshape(-1, data.n_u), y_ini.reshape(-1, data.n_y)
-        self.refs = {"y_ref": y_ref.reshape(-1, data.n_y), "u_ref": u_ref.reshape(-1, data.n_u)}
-        reduction = layer.reduction.detach()
-        self.v0, self.G = (x.cpu().numpy() for x in (reduction.V @ theta, reduction.G))
-        Vp = reduction.V[:, sizes[0] : sizes[0] + sizes[1]].cpu().numpy()
-        lower, upper = (b.detach().cpu().expand(len(self.v0)).numpy() for b in layer.bounds(theta.device))
-        self.bounds = lower, upper
-        self.of_s: Budgeted = in_few_variables(Vp, budget.norm_bounds(self.y_ini))
-        self.A = Vp @ self.of_s.N
-        self.n_u = data.horizon * data.n_u
-        self.target = cost.rows_at(step, data.horizon).double().cpu().expand(data.horizon, data.n_u).flatten().numpy()
+        self.share_of_time = SETTINGS.share * time_limit
+        self.window, self.cost, self.step, self.tolerance = window, cost.at(step), step, tolerance
+        self.target_input = cost
+        horizon = window.layer.data.horizon
+        target = cost.rows_at(step, horizon).double().cpu().expand(horizon, -1)
+        self.target = target.flatten().numpy()
 
     def solve(self) -> tuple[Tensor, tuple[float, float, float, float, float]]:
         """Return p, and value, bound, psi without an attack, nodes and seconds."""
-        nominal = self.layer(self.u_ini, self.y_ini, **self.refs, on_failure="raise")
-        psi = float(self.cost.at(self.step)(nominal))
-        found = Search(np.zeros(self.A.shape[1]), psi, bound=psi)
-        if self.A.size:
+        window = self.window
+        psi = float(self.cost(window.nominal))
+        found = Search(np.zeros(window.A.shape[1]), psi, bound=psi)
+        if window.A.size:
             active = self._first(found)
-            rows, cost = self._rows(nominal.lam.cpu().numpy(), active, found)
-            search(
-                *(rows, self.of_s.pieces, cost, self._replay, found),
-                tolerance=self.tolerance,
-                deadline=self.deadline,
-            )
-            found.bound -= self._effect_of_unseen(rows, found.value)
+            rows = self._reachable()
+            if rows.H is None:
+                rows, least = self._rows(active), 0.0  # psi is not negative
+            else:
+                least = self._by_moments(rows, found)
+            if least < found.value - self.tolerance * abs(found.value) and time.monotonic() < self.deadline:
+                pieces = window.of_s.pieces
+                search(
+                    *(rows, pieces, self._psi(rows), self._replay, found),
+                    tolerance=self.tolerance,
+                    deadline=self.deadline,
+                )
+                least = max(least, found.bound)
+            found.bound = min(least, found.value) - self._effect_of_unseen(rows, found.value)
         seconds = time.monotonic() - self.began
-        return self._perturbation(found.s), (found.value, found.bound, psi, float(found.nodes), seconds)
+        return window.perturbation(found.s), (found.value, found.bound, psi, float(found.nodes), seconds)
 
     def _first(self, found: Search) -> NDArray[np.bool_]:
         """Note the answer of projected gradient; return which rows are active under it or a random perturbation."""
-        generator = torch.Generator(self.y_ini.device).manual_seed(0)
-        attack = ProjectedGradientAttack(self.layer, self.cost, self.budget, SETTINGS.steps, restarts=SETTINGS.restarts)
-        p = attack(self.u_ini, self.y_ini, **self.refs, generator=generator, step=self.step)
-        s = np.linalg.lstsq(self.of_s.N, p.flatten().cpu().numpy(), rcond=None)[0]
+        window = self.window
+        generator = torch.Generator(window.y_ini.device).manual_seed(0)
+        attack = ProjectedGradientAttack(
+            window.layer, self.target_input, window.budget, SETTINGS.steps, restarts=SETTINGS.restarts
+        )
+        p = attack(window.u_ini, window.y_ini, **window.refs, generator=generator, step=self.step)
+        s = np.linalg.lstsq(window.of_s.N, p.flatten().cpu().numpy(), rcond=None)[0]
         value = self._replay(s)
         if value < found.value:
             found.s, found.value = s, value
-        many = self.y_ini.expand(SETTINGS.samples, -1, -1)
-        y_ini = torch.cat([many + self.budget.random(many, generator), (self.y_ini + p)[None]])
-        plans = self.layer(self.u_ini.expand(len(y_ini), -1, -1), y_ini, **self.refs, on_failure="nan")
+        many = window.y_ini.expand(SETTINGS.samples, -1, -1)
+        y_ini = torch.cat([many + window.budget.random(many, generator), (window.y_ini + p)[None]])
+        plans = window.layer(window.u_ini.expand(len(y_ini), -1, -1), y_ini, **window.refs, on_failure="nan")
         solved = plans.info.status == Status.SOLVED
         return (plans.lam[solved] != 0).any(0).cpu().numpy()
 
-    def _rows(self, lam: Array, active: NDArray[np.bool_], found: Search) -> tuple[Rows, Quadratic]:
-        """Return the rows that may reach a bound, their intervals tightened, and psi over s and their multipliers.
+    def _reachable(self) -> Rows:
+        """Return the rows that the intervals of nonexpansiveness let reach a bound."""
+        index = np.flatnonzero(self.window.has_bound)
+        for _ in range(2):  # intervals of fewer rows, which may be independent, are narrower
+            rows = self.window.rows(index)
+            rows.propagate()
+            index = index[allowed_states(rows) != FREE]
+        return self.window.rows(index)
+
+    def _by_moments(self, rows: Rows, found: Search) -> float:
+        """Return a lower bound of psi, and shrink the rows' intervals to what is left of plans below the value."""
+        window, psi = self.window, self._psi(rows)
+        lam, channel, until = window.lam[rows.index], window.channel[rows.index], self.began + self.share_of_time
+        rows.propagate()
+        least, goal = 0.0, found.value - self.tolerance * abs(found.value)
+        for _ in range(SETTINGS.moment_rounds):
+            moments = Moments(rows, window.of_s.pieces, lam)
+            precision = SETTINGS.precision * self.tolerance * abs(found.value)
+            options: dict[str, Any] = {"enough": goal + 2 * precision, "tolerance": precision, "deadline": until}
+            bounded = moments.minimum(moments.quadratic(psi), **options)
+            found.nodes += 1
+            if bounded is None:
+                break
+            before, least = least, max(least, bounded.bound - DUAL_SLACK * (1 + abs(bounded.bound)))
+            closed = least - before > SETTINGS.progress * (found.value - least)
+            if least >= goal or not closed or time.monotonic() > until:
+                break
+            if not shrink(rows, window.of_s.pieces, lam, channel, until, (psi, found.value)):
+                return found.value
+        else:
+            tighten(rows, window.of_s, until)
+        return least
+
+    def _rows(self, active: NDArray[np.bool_]) -> Rows:
+        """Return the rows that may reach a bound, their intervals tightened.
 
         Inputs come first. Another row is added if the plan that does not know its bound could pass it; where none
         could, that plan is the plan of the whole problem.
         """
-        finite = np.isfinite(self.bounds[0]) | np.isfinite(self.bounds[1])
-        chosen = finite & (active | (lam != 0) | (np.arange(len(lam)) < self.n_u))
+        window, until = self.window, self.began + self.share_of_time
+        lam, finite = window.lam, window.has_bound
+        chosen = finite & (active | (lam != 0) | (np.arange(len(lam)) < window.n_u))
         while True:
             index = np.flatnonzero(chosen)
-            nominal = self.v0 - self.G @ lam, lam
-            rows = Rows.of(index, self.v0, self.A, self.G, self.bounds, nominal, self.of_s)
+            rows = window.rows(index)
             for _ in range(SETTINGS.rounds):
-                tighten(rows, self.of_s, self.tighten_until)
+                tighten(rows, window.of_s, until)
             rest = np.flatnonzero(finite & ~chosen)
-            other = self.v0[rest], self.A[rest], self.G[np.ix_(rest, index)]
-            ends = self.bounds[0][rest], self.bounds[1][rest]
-            more = others_that_reach(rows, self.of_s, *other, ends, self.tighten_until)
+            other = window.v0[rest], window.A[rest], window.G[np.ix_(rest, index)]
+            ends = window.bounds[0][rest], window.bounds[1][rest]
+            more = others_that_reach(rows, window.of_s, *other, ends, until)
             if not more:
-                return rows, self._psi(rows)
+                return rows
             chosen[rest[more]] = True
 
     def _psi(self, rows: Rows) -> Quadratic:
-        B_lam = -self.G[: self.n_u, rows.index]
-        return Quadratic(self.v0[: self.n_u] - self.target, self.A[: self.n_u], B_lam)
+        window, n_u = self.window, self.window.n_u
+        return Quadratic(window.v0[:n_u] - self.target, window.A[:n_u], -window.G[:n_u, rows.index])
 
     def _effect_of_unseen(self, rows: Rows, value: float) -> float:
         """Return by how much the directions of p that were dropped can lower psi."""
         values = np.linalg.eigvalsh(rows.G) if len(rows.G) else np.ones(1)
-        moved = self.of_s.unseen * float(np.sqrt(values[-1] / values[values > 1e-12 * values[-1]][0]))
+        moved = self.window.of_s.unseen * float(np.sqrt(values[-1] / values[values > 1e-12 * values[-1]][0]))
         return moved * (2 * value) ** 0.5
 
-    def _perturbation(self, s: Array) -> Tensor:
-        p = torch.from_numpy(self.of_s.N @ s).to(self.y_ini).reshape(self.y_ini.shape)
-        return within_budget(self.budget.project(p, self.y_ini), self.y_ini, self.budget)
-
     def _replay(self, s: Array) -> float:
-        plan = self.layer(self.u_ini, self.y_ini + self._perturbation(s), **self.refs, on_failure="nan")
-        return float(self.cost.at(self.step)(plan)) if int(plan.info.status) == Status.SOLVED else np.inf
+        plan = self.window.plan(s)
+        return float(self.cost(plan)) if int(plan.info.status) == Status.SOLVED else np.inf
