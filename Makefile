@@ -34,7 +34,7 @@ test: $(ENV)  ## every test and docstring example (ARGS="-m 'not slow'" for the 
 	set -x; $(PY) -m pytest -n auto --dist worksteal tests --doctest-modules torch_dpc baselines $$ignore $(ARGS) && \
 	{ TORCH_DPC_NO_KERNELS=1 $(PY) -m pytest -q -n auto -m "not slow" $(NUMERICAL) $(ARGS) || test $$? -eq 5; }
 
-bench: $(ENV)  ## time and error of the layer (ARGS=--quick for a short run)
+bench: $(ENV)  ## time and error of the layer (ARGS=--quick for a short run, ARGS=--check for the regression guard)
 	$(PY) -m scripts.benchmark $(ARGS)
 
 fuzz: $(ENV)  ## 10,000 random problems against an independent reference (ARGS="-n 100"; resumes where it was stopped)

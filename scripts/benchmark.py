@@ -3,6 +3,8 @@
     python -m scripts.benchmark             # about 40 minutes on two cores
     python -m scripts.benchmark --quick     # under 2 minutes: the masses at horizon 25, the fastest peers
     python -m scripts.benchmark --scaling   # the number of recorded windows, 500 to 50,000, alone
+    python -m scripts.benchmark --check     # the regression guard: ratios within one process, half a minute
+    python -m scripts.benchmark --sets      # balls, cones, soft boxes and learnable weights, 3 minutes
     python -m scripts.benchmark --docs      # everything, then Table I and the profile, all into docs/benchmarks.md
 
 Both plants of the paper, horizons 25 to 100, batches 1 to 1024; every peer in `baselines/` on the QP as the paper
@@ -35,12 +37,15 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any
 
+import torch
 from tqdm import tqdm
 
 from scripts.bench.cases import LOOP, OURS, SEED, Row, full_rows, quick_rows, scaling_rows, write_case
+from scripts.bench.check import check
 from scripts.bench.docs import refresh
 from scripts.bench.report import write_report
 from scripts.bench.row import MARK, measure
+from scripts.bench.sets import write_sets
 from scripts.shared.command import RESULTS, ROOT, cores
 from torch_dpc.solve.kernels import instructions
 
@@ -235,6 +240,8 @@ def main(argv: list[str] | None = None) -> None:
     parser.add_argument("--quick", action="store_true", help="the masses at horizon 25 and the fastest peers alone")
     parser.add_argument("--scaling", action="store_true", help="only the rows that let n_g grow")
     parser.add_argument("--docs", action="store_true", help="refresh every table and picture of docs/benchmarks.md")
+    parser.add_argument("--check", action="store_true", help="only compare ratios of times with stored ones")
+    parser.add_argument("--sets", action="store_true", help="only sets that are no boxes, and learnable weights")
     parser.add_argument("--only", default="", help="only the rows whose name contains this")
     parser.add_argument("--fresh", action="store_true", help="forget what was measured before")
     parser.add_argument("--threads", type=int, default=cores(), help="of every solver (default: one a core)")
@@ -245,6 +252,15 @@ def main(argv: list[str] | None = None) -> None:
         order = dict(args.row)
         case, mode, threads = (order.pop(name) for name in ("case", "mode", "threads"))
         return measure(Row(**order), Path(case), mode, threads)
+
+    if args.check or args.sets:
+        torch.set_num_threads(1)
+    if args.check:
+        grown = check()
+        sys.exit(f"slower than stored: {', '.join(grown)}" if grown else 0)
+    if args.sets:
+        print(write_sets(args.out))
+        return
 
     from baselines import PEERS
 
