@@ -78,12 +78,13 @@ sanitize: $(ENV)  ## the kernels under the address, undefined-behaviour and thre
 	PYTHONPATH=$$PWD $$root/$(PY) -m pytest -q -p no:cacheprovider -k "not without" \
 	$$root/tests/solve/test_kernels.py $$root/tests/solve/test_kernel_sets.py
 
-# The README runs from an empty folder, so that what it imports is the wheel.
+# The README runs from an empty folder, so that what it imports is the wheel; pip must not find the sources on PYTHONPATH.
+package: export PYTHONPATH :=
 package: $(ENV)  ## sdist and wheel into dist/, tried in a clean environment with the core dependencies alone
 	rm -rf dist build/clean && $(PY) -m build -n -o dist .
 	$(PY) -m venv build/clean
 	build/clean/bin/python -m pip --disable-pip-version-check -qq install -c constraints.txt dist/*.whl
-	mkdir -p build/empty && cd build/empty && unset PYTHONPATH && PATH=../clean/bin:$$PATH && python -W error -c 'import torch_dpc' && \
+	mkdir -p build/empty && cd build/empty && PATH=../clean/bin:$$PATH && python -W error -c 'import torch_dpc' && \
 	python ../../tests/run_readme.py ../../README.md && python -c 'from torch_dpc.solve import kernels; print("vector instructions:", kernels.instructions())'
 
 clean:  ## remove what the other targets leave, but keep .venv
