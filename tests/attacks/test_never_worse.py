@@ -1,5 +1,7 @@
 """Attacks of several steps are never worse than Algorithm 1, whatever the cost, the budget and the precision."""
 
+import functools
+
 import pytest
 import torch
 
@@ -26,6 +28,7 @@ COSTS = {
     ),
     "last output": lambda layer: lambda plan: -plan.y[..., -1, 0],
     "kinks": lambda layer: lambda plan: -plan.y.abs().sum((-2, -1)) + (plan.u - 0.1).abs().sum((-2, -1)),
+    "violation": lambda layer: attacks.BoundViolation(-0.1, 0.1),
     "near zero": lambda layer: lambda plan: 1e-6 * (plan.u.square().sum((-2, -1)) - 1e-3),
 }
 
@@ -54,3 +57,43 @@ def test_never_worse(name, dtype):
         ]
         for other in psi[1:]:
             assert (other <= psi[0] + ROUNDING[dtype] * psi[0].abs().clamp_min(float(psi[0].abs().mean()))).all(), trial
+
+
+@functools.cache
+def quadrotor_layer():
+    """A small planning problem of the quadrotor, attitude within +-pi/8."""
+    source = generator(0)
+    u, y = dpc.collect(dpc.systems.TorchQuadrotor(), 150, amplitude=0.5, hold=10, generator=source)
+    data = dpc.HankelData.from_trajectories(u, y, t_ini=3, horizon=6)
+    Q = torch.diag(torch.tensor([10.0, 10.0, 10.0, 0.0, 0.0, 0.0]))
+    reach = torch.tensor([20.0, 20.0, 20.0, *[torch.pi / 8] * 3])
+    box = dpc.Box(-1.0, 1.0), dpc.Box(-reach, reach)
+    return dpc.DPCLayer(data, Q=Q, R=torch.eye(3), lambda_g=100.0, lambda_s=1e6, u_set=box[0], y_set=box[1]), u, y
+
+
+@pytest.mark.parametrize("name", ["target", "tracking", "violation"])
+def test_never_worse_on_the_quadrotor(name):
+    layer, u, y = quadrotor_layer()
+    costs = {
+        "target": attacks.TargetInput(torch.tensor([0.0, 1.0, 0.0])),
+        "tracking": attacks.TrackingError(layer.data),
+    }
+    cost = costs.get(name, attacks.BoundViolation(-0.1, 0.1))
+    at = torch.arange(10, 130, 12)[:, None] + torch.arange(3)
+    u_ini, y_ini, y_ref = u[at], y[at], y.mean(0)
+    for rho in (1e-3, 1e-2):
+        budget = attacks.RelativeBall(rho)
+        psi_of = cost.given(u_ini=u_ini, y_ini=y_ini, y_ref=y_ref) if hasattr(cost, "given") else cost
+        psi = [
+            psi_of(layer(u_ini, y_ini + attack(u_ini, y_ini, y_ref=y_ref, generator=generator(1)), y_ref=y_ref))
+            for attack in (
+                attacks.LinearizedAttack(layer, cost, budget),
+                attacks.ProjectedGradientAttack(layer, cost, budget, 6, restarts=2),
+                attacks.FrankWolfeAttack(layer, cost, budget, 6),
+            )
+        ]
+        for other in psi[1:]:
+            assert (
+                other <= psi[0] + ROUNDING[torch.float64] * psi[0].abs().clamp_min(float(psi[0].abs().mean()))
+            ).all()
+        assert (psi[1] < psi[0]).any()
