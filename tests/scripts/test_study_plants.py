@@ -16,6 +16,8 @@ LINEAR = 1e-3  # relative to the largest deviation
 
 @pytest.mark.parametrize("name", plants.CASES)
 def test_the_linearised_model_answers_like_the_plant_to_small_inputs(name):
+    if name == "quadrotor":
+        pytest.importorskip("pybullet", reason="the quadrotor needs PyBullet: pip install '.[quadrotor]'")
     case = plants.CASES[name]()
     plant, model = case.make(0 * case.noise, plants.generator_of(0)), case.model()
     u, answer = dpc.collect(model, 40, generator=plants.generator_of(1), amplitude=SMALL * case.amplitude)
