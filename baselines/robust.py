@@ -97,13 +97,14 @@ class RobustDPC(DPCLayer):
         self._largest = max(float(s[0]), np.finfo(float).tiny)
         U, d = U[:, s > RANK * s[0]], np.square(s[s > RANK * s[0]] / self._largest)
         u, slack, excess = cp.Variable(n_u), cp.Variable(n_y, nonneg=True), cp.Variable(nonneg=True)
-        of_u, of_a, of_along = cp.Parameter(len(maps.root_R)), cp.Parameter(len(maps.root_Q)), cp.Parameter(len(d))
-        free, reach, tighten = cp.Parameter(n_y), cp.Parameter(nonneg=True), cp.Parameter(n_y, nonneg=True)
         A = maps.root_Q @ maps.K_u
+        orthogonal, triangle = np.linalg.qr(np.concatenate([maps.root_R, A]))  # both squares as one, n_u rows
+        of_cost, of_along = cp.Parameter(len(triangle)), cp.Parameter(len(d))
+        free, reach, tighten = cp.Parameter(n_y), cp.Parameter(nonneg=True), cp.Parameter(n_y, nonneg=True)
         along = U.T @ A @ u + of_along
         # lambda = s_1^2 (1 + excess): every term in units of s_1
         worst = reach * (1 + excess) + sum(d[i] * cp.quad_over_lin(along[i], 1 + excess - d[i]) for i in range(len(d)))
-        cost = cp.sum_squares(maps.root_R @ u + of_u) + cp.sum_squares(A @ u + of_a) + worst
+        cost = cp.sum_squares(triangle @ u + of_cost) + worst
         y = maps.K_u @ u + free
         lower, upper = (x.detach().numpy(force=True)[: n_u + n_y] for x in self.bounds(data.device))
         rows: list[Any] = []
@@ -114,9 +115,9 @@ class RobustDPC(DPCLayer):
             if in_y.any():
                 rows.append(sign * y[in_y] <= sign * end[n_u:][in_y] - tighten[in_y] + slack[in_y])
         problem = cp.Problem(cp.Minimize(0.5 * cost + SLACK * cp.sum(slack)), rows)
-        names = {"problem": problem, "u": u, "free": free, "of_u": of_u, "of_a": of_a, "of_along": of_along}
+        names = {"problem": problem, "u": u, "free": free, "of_cost": of_cost, "of_along": of_along, "reach": reach}
         row = np.linalg.norm(maps.K_y, axis=1)
-        return {**names, "reach": reach, "tighten": tighten, "maps": maps, "U": U, "row": row}
+        return {**names, "tighten": tighten, "maps": maps, "U": U, "orthogonal": orthogonal, "row": row}
 
     def forward(
         self, u_ini: Any, y_ini: Any, *, y_ref: Any = None, u_ref: Any = None, on_failure: str | None = None
@@ -156,7 +157,8 @@ class RobustDPC(DPCLayer):
         maps = posed["maps"]
         free = maps.K_past @ past.numpy()
         off = maps.root_Q @ (free - y_ref.numpy())
-        values = {"free": free, "of_u": -maps.root_R @ u_ref.numpy(), "of_a": off, "of_along": posed["U"].T @ off}
+        targets = np.concatenate([-maps.root_R @ u_ref.numpy(), off])
+        values = {"free": free, "of_cost": posed["orthogonal"].T @ targets, "of_along": posed["U"].T @ off}
         for name, value in values.items():
             posed[name].value = value
         posed["reach"].value = max(radius * self._largest, SMALLEST) ** 2

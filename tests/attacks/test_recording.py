@@ -37,10 +37,13 @@ def planner(data, **options):
 
 
 @pytest.mark.parametrize(
-    "options", [{}, {"affine": True}, {"regularizer": "identity"}], ids=["paper", "affine", "identity"]
+    ("options", "ridge"),
+    [({}, 0.0), ({"affine": True}, 0.0), ({"regularizer": "identity"}, 0.0), ({}, 0.01), ({"affine": True}, 0.01)],
+    ids=["paper", "affine", "identity", "ridge", "affine ridge"],
 )
-def test_the_influence_is_the_derivative_in_every_windows_weight(options):
+def test_the_influence_is_the_derivative_in_every_windows_weight(options, ridge):
     layer = small_layer(**options)
+    layer = planner(layer.data.with_ridge(ridge), **options) if ridge else layer
     data = layer.data.with_ones if layer.affine else layer.data
     found = attacks.window_influence(layer, COST, U_INI, Y_INI, **REFS)
     assert layer(U_INI, Y_INI, **REFS).info.n_active.sum() > 0  # bounds are met
@@ -174,6 +177,15 @@ def test_a_tracking_attack_raises_the_true_error():
         return float((y - REFS["y_ref"])[..., :2].square().sum())
 
     assert error(found.layer) > 1.05 * error(layer)
+
+
+def test_a_ridge_stays_in_the_poisoned_data():
+    u, y = recording()
+    data = dpc.HankelData.from_trajectories(u, y, t_ini=3, horizon=6).with_ridge(0.05)
+    found = attacks.PoisonedRecording(planner(data), COST, BUDGET, samples=5)(u, y, U_INI, Y_INI, **REFS)
+    again = dpc.HankelData.from_trajectories(u, found.y, t_ini=3, horizon=6).with_ridge(0.05)
+    assert math.isclose(found.after, float(psi(planner(again))), rel_tol=1e-9)
+    assert math.isclose(found.before, float(psi(planner(data))), rel_tol=1e-9) and found.after < found.before
 
 
 def test_what_does_not_fit_is_named():

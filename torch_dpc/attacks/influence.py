@@ -26,7 +26,7 @@ def weigh_windows(data: HankelData, weights: Any) -> HankelData:
 
     Args:
         data: recorded windows, not compact.
-        weights: `(n_g,)`, not negative; a graph is kept.
+        weights: `(n_g,)`, not negative, those of a ridge's columns last; a graph is kept.
 
     Raises:
         ValueError: weights that do not fit, or compact data.
@@ -50,7 +50,9 @@ def weigh_windows(data: HankelData, weights: Any) -> HankelData:
         )
     root = weights.sqrt().to(data.device)
     columns = {name: getattr(data, name).double() * root for name in ("Up", "Uf", "Yp", "Yf")}
-    return replace(data, **columns, windows_seen=data.n_windows, recorded_as=data.recorded_as or data.Up.dtype)
+    return replace(
+        data, **columns, windows_seen=data.n_windows, n_ridge=0, recorded_as=data.recorded_as or data.Up.dtype
+    )
 
 
 def window_influence(

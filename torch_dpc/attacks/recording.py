@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import torch
@@ -33,7 +33,7 @@ CHOICES = ("influence", "greedy", "random")
 class PoisonSettings:
     """Constants of the search."""
 
-    rounds: int = 10  # in which "greedy" chooses its samples; each costs up to three evaluations
+    rounds: int = 10  # in which "greedy" chooses its samples
     lengths: tuple[float, ...] = (1.0, 0.5, 0.25)  # of the step with new samples, tried until psi falls
     shorter: float = 0.5  # factor on the length of a step after one that did not lower psi
 
@@ -104,6 +104,7 @@ class PoisonedRecording(Described):
         self, layer: DPCLayer, cost: Any, budget: Budget, *, samples: Any, choose: str = "influence", steps: int = 10
     ):
         check_type("layer", layer, DPCLayer)
+        check_type("layer.data", layer.data, HankelData)
         check_cost(cost)
         check_type("budget", budget, Budget)
         if not budget.convex:
@@ -229,9 +230,16 @@ class _Search:
     def layer(self, p: Tensor) -> DPCLayer:
         """Return the layer that plans with the poisoned recording."""
         data = self.attack.layer.data
+        assert isinstance(data, HankelData)
         with warnings.catch_warnings():
             warnings.simplefilter("ignore", ExcitationWarning)  # of the inputs, which are not changed
             poisoned = HankelData.from_trajectories(self.us, self.outputs(p), t_ini=data.t_ini, horizon=data.horizon)
+        if data.n_ridge:  # the controller's own, which no recording changes
+            wider: dict[str, Any] = {}
+            for name in ("Up", "Uf", "Yp", "Yf"):
+                ridge = getattr(data, name)[:, -data.n_ridge :].to(p)
+                wider[name] = torch.cat([getattr(poisoned, name), ridge], dim=1)
+            poisoned = replace(poisoned, **wider, n_ridge=data.n_ridge)
         return DPCLayer(poisoned, **self.attack.layer.config())
 
     def outputs(self, p: Tensor) -> list[Tensor]:
