@@ -153,6 +153,25 @@ def sets_beside_boxes(plant: str) -> Iterator[tuple[str, int, float, float, floa
             yield name, batch, times[name], alone[name] / alone["box"], times[name] / times["box"]
 
 
+def latencies(calls: int = 20_000) -> Iterator[tuple[str, list[float]]]:
+    """Yield (call, [median, 99 %, 99.9 %, worst] in ms) of single plans, the masses, one after the other."""
+    layer, inputs = case("masses", 64)
+    one, loop = problems_of(inputs, 1), DaqpLoop(layer)
+    prepared = [loop.prepare(problem) for problem in one]
+    named: Calls = {
+        "torch_dpc, forward": forward(layer, one),
+        "torch_dpc, forward and backward": both(layer, one),
+        "DAQP in a Python loop, forward": lambda i: loop(**prepared[i % CYCLE]),
+    }
+    for name, call in named.items():
+        times = np.empty(calls)
+        for i in range(-100, calls):  # the first 100 are overwritten: they warm up
+            began = time.process_time()
+            call(i % CYCLE)
+            times[i] = 1e3 * (time.process_time() - began)
+        yield name, np.percentile(times, (50, 99, 99.9, 100)).tolist()
+
+
 def learning_steps() -> dict[str, float]:
     """Return the time of a training step [ms], masses, by what learns."""
     layer, inputs = case("masses", 64)

@@ -8,7 +8,7 @@ from pathlib import Path
 from tqdm import tqdm
 
 from scripts.bench.ball import rows as ball_rows
-from scripts.bench.ratios import learning_steps, sets_beside_boxes
+from scripts.bench.ratios import latencies, learning_steps, sets_beside_boxes
 from scripts.shared.command import versions
 
 PLANTS = ("masses", "quadrotor")
@@ -17,7 +17,7 @@ PLANTS = ("masses", "quadrotor")
 def write_sets(out: Path) -> str:
     """Measure everything, write sets.md, and return it. About 3 minutes on an idle core."""
     lines = [f"{versions(1, 1).split(';')[0]}; one thread; processor time.", ""]
-    for table in tqdm((_sets(), _learning(), _ball()), desc="Sets", unit="table"):
+    for table in tqdm((_latencies(), _learning(), _ball(), _sets()), desc="Sets", unit="table"):
         lines += [*table, ""]
     text = "\n".join(lines)
     out.mkdir(parents=True, exist_ok=True)
@@ -31,6 +31,13 @@ def _sets() -> Iterator[str]:
     for plant in PLANTS:
         for name, batch, time, forward, both in sets_beside_boxes(plant):
             yield f"| {plant} | {name} | {batch} | {time:.3g} | {forward:.2g} | {both:.2g} |"
+
+
+def _latencies() -> Iterator[str]:
+    yield "| 20,000 calls, masses, batch 1 | median [ms] | 99 % | 99.9 % | worst |"
+    yield "|---|---:|---:|---:|---:|"
+    for name, times in latencies():
+        yield f"| {name} | {' | '.join(f'{time:.3g}' for time in times)} |"
 
 
 def _learning() -> Iterator[str]:

@@ -40,6 +40,9 @@ def load(path: Path) -> ModuleType:
     return module
 
 
+NAMES = ("solve_boxes", "solve_active", "adjoint", "solve_sets", "solve_held", "plan_one", "adjoint_one")
+
+
 class Caller:
     """Random arguments for every entry point."""
 
@@ -100,7 +103,41 @@ class Caller:
             return [G, v, self.sets(count, n), out, np.zeros(count, np.int64), flags]
         if name == "solve_held":
             return [G, self.sets(count, n), v, normal((count, n)), active, normal((count, n)), out, flags]
+        if name in ("plan_one", "adjoint_one"):
+            return self.one(name, max(n, 1))
         return [G, active, v, normal((count, n)) if self.random.random() < 0.5 else None, out, flags]
+
+    def one(self, name: str, n: int) -> list[Any]:
+        """Arguments of one sample, which fit."""
+        normal, n_theta = self.random.standard_normal, int(self.random.integers(1, 20))
+        G = normal((n, n + 3))
+        of = (G @ G.T, normal((n, n_theta)), np.ones(n_theta), np.ones(n), np.ones(n), 1e-15, 1e-15, 1e-15)
+        sets = tuple(x[0] if i < 3 and x is not None and x.ndim == 2 else x for i, x in enumerate(self.sets(1, n)))
+        vector, flags = (lambda: np.full(n, np.nan)), (lambda: np.zeros(n, bool))
+        if name == "plan_one":
+            return [
+                of,
+                sets,
+                self.windows(n_theta),
+                np.empty(n_theta),
+                vector(),
+                vector(),
+                flags(),
+                flags(),
+                np.empty(5),
+            ]
+        at = normal(n), normal(n), normal(n) > 0, normal(n) > 0
+        return [of, sets, *at, self.windows(2 * n), np.empty(2 * n), np.empty(n_theta)]
+
+    def windows(self, size: int) -> tuple[int, ...]:
+        """Addresses, counts and sizes of parts with so many places in all; the arrays behind them are kept."""
+        cuts = np.sort(self.random.integers(0, size + 1, 3))
+        self.kept, found = [], []
+        for width in map(int, np.diff([0, *cuts, size])):
+            given = self.random.choice([k for k in range(1, width + 1) if width % k == 0]) if width else 0
+            self.kept.append(self.random.standard_normal(max(given, 1)))
+            found += [self.kept[-1].ctypes.data if given else 0, int(given), width]
+        return tuple(found)
 
     def sets(self, count: int, n: int) -> tuple[Any, ...]:
         """Intervals, balls and cones on random rows."""
@@ -127,14 +164,17 @@ class Caller:
     def call(self, spoils: bool) -> str:
         """Make one call; return how it ended."""
         count, n = int(self.random.choice(COUNTS)), int(self.random.choice(SIZES))
-        name = str(self.random.choice(["solve_boxes", "solve_active", "adjoint", "solve_sets", "solve_held"]))
+        name = str(self.random.choice(NAMES))
         arguments = self.arguments(name, count, n)
         if spoils:
             place = self.random.integers(len(arguments))
             if isinstance(arguments[place], tuple):
                 parts = list(arguments[place])
                 which = self.random.integers(len(parts))
-                parts[which] = None if parts[which] is None else self.spoil(parts[which])
+                if isinstance(parts[-1], int):  # windows: other addresses or counts would read what is not there
+                    parts[which // 3 * 3 + 2] = int(self.random.integers(-2, 60))
+                elif isinstance(parts[which], np.ndarray):
+                    parts[which] = self.spoil(parts[which])
                 arguments[place] = tuple(parts)
             elif isinstance(arguments[place], np.ndarray):
                 arguments[place] = self.spoil(arguments[place])
