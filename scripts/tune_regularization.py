@@ -6,11 +6,12 @@
 lambda_g, lambda_s and the diagonals of Q and R are tuned on recorded windows of three training recordings
 (torch_dpc.tuning), by the gradient and by Optuna at the same processor time; and once more on data with the ridge of
 study_noise.py. Validation recordings choose one point of each kind by `QUICK_TRIALS`: no scenario without an attack may
-get worse. Held-out recordings then judge three candidates by all `TRIALS` (scripts/regularization/trials.py): the tuned
-weights, the paper's weights with the ridge, and the weights tuned with the ridge; from rest away from the reference,
-from random starts, pushed, with a changing reference, under random noise, Algorithm 1, projected gradient, a black box
-and a trained policy, each attacker knowing the weights. Rows are saved as they are made; a killed run goes on where it
-stopped (--fresh begins anew; --quick has files of its own). Leaves, in results/:
+get worse. Each tuned point that may be chosen is tried with the ridge, too. Held-out recordings then judge three
+candidates by all `TRIALS` (scripts/regularization/trials.py): the tuned weights, the paper's weights with the ridge,
+and tuned weights with it; from rest away from the reference, from random starts, pushed, with a changing reference,
+under random noise, Algorithm 1, projected gradient, a black box and a trained policy, each attacker knowing the
+weights. Rows are saved as they are made; a killed run goes on where it stopped (--fresh begins anew; --quick has files
+of its own). Leaves, in results/:
 
     tuning_{plant}.csv          one row a closed-loop run: mean and largest error [m]
     tuning_{plant}_points.csv   the weights of every point, and what the search that found it cost
@@ -33,7 +34,16 @@ from scripts.experiments.all_cases import CASES
 from scripts.experiments.case import Case, Weights
 from scripts.regularization.objectives import HELD_OUT_FROM, VALIDATION
 from scripts.regularization.picture import draw
-from scripts.regularization.report import HELD_OUT, RIDGE, VALIDATED, candidates, has_ridge, write_report
+from scripts.regularization.report import (
+    HELD_OUT,
+    RIDGE,
+    VALIDATED,
+    candidates,
+    has_ridge,
+    twins,
+    without_ridge,
+    write_report,
+)
 from scripts.regularization.search import (
     ATTACKED_WEIGHTS,
     GUARDED,
@@ -168,6 +178,9 @@ def tune_plant(
 
     tuned = {c.name: {r["point"]: weights_of(r) for r in points.rows() if r["case"] == c.name} for c in cases}
     close_loops(runs, [job for c in cases for job in validation_jobs(c, tuned[c.name])], workers, plant)
+    for c in cases:  # every point that may be chosen is tried once more with the ridge
+        tuned[c.name] |= {n: tuned[c.name][without_ridge(n)] for n in twins(points.rows(), runs.rows(), c)}
+    close_loops(runs, [job for c in cases for job in validation_jobs(c, tuned[c.name])], workers, f"{plant}, ridge")
     known = {c.name: {"paper": c.paper(), RIDGE: c.paper(), **tuned[c.name]} for c in cases}
     judged = {c.name: ["paper", *candidates(points.rows(), runs.rows(), c)] for c in cases}
     jobs = [job for c in cases for job in judge_jobs(c, {n: known[c.name][n] for n in judged[c.name]}, seeds)]

@@ -33,7 +33,7 @@ LOOKS: dict[str, dict[str, Any]] = {
     WINDOWS: {"color": "#009e73", "marker": "^"},
     CLOSED_LOOP: {"color": "#35178c", "marker": "v"},
 }
-CURVES = {WINDOWS: "trained on windows: decrease of psi", CLOSED_LOOP: "trained in closed loop: error of the run"}
+CURVES = {WINDOWS: r"trained on windows: decrease of $\psi$", CLOSED_LOOP: "trained in closed loop: error of the run"}
 SIZE = (6.4, 4.0)  # of a picture with one panel [inches]
 SHOWN = 400  # iterations of imitation in the picture
 HEAD = """# Trained adversaries: {plant}
@@ -195,12 +195,13 @@ def _loop(path: Path, rows: Rows, rhos: Sequence[float]) -> None:
     """Draw the error in closed loop over Algorithm 1's, with its interval; one panel a setting."""
     settings = [s for s in dict.fromkeys(rows["setting"]) if s != HELD_OUT_WINDOWS]
     figure, panels = plt.subplots(1, len(settings), figsize=(8.4, 4.2), sharey=True, squeeze=False)
+    highest = 1.0
     for axes, setting in zip(panels[0], settings, strict=True):
         names = [name for name in names_in(rows, setting) if name != POISON]
         for i, name in enumerate(names):
             found = [loop_ratio(rows, setting, name, rho)[0] for rho in rhos]
             places = np.arange(len(rhos)) + 0.09 * (i - (len(names) - 1) / 2)
-            colour = LOOKS[name]["color"]
+            colour, highest = LOOKS[name]["color"], max(highest, *(f.high for f in found))
             axes.vlines(places, [f.low for f in found], [f.high for f in found], color=colour, linewidth=1.4)
             axes.plot(places, [f.value for f in found], linestyle="None", label=TITLES[name], **LOOKS[name])
         axes.axhline(1.0, color=COLOURS[POISON], linestyle=(0, (4, 2)), linewidth=1.2, label=TITLES[POISON])
@@ -208,8 +209,7 @@ def _loop(path: Path, rows: Rows, rhos: Sequence[float]) -> None:
         axes.set_xticks(range(len(rhos)), [f"{100 * rho:g}" for rho in rhos])
         axes.grid(axis="x", visible=False)
     panels[0, 0].set_ylabel("mean error / Algorithm 1's")
-    top = panels[0, 0].get_ylim()[1]
-    panels[0, 0].set_ylim(0, 1.12 * top)
+    panels[0, 0].set_ylim(0, 1.15 * highest)  # room for the notes
     seeds = chosen(rows, "mean_error", settings[0], POISON, rhos[0]).shape[1]
     trained = len(np.unique(rows["trained"][rows["trained"] >= 0]))
     note(panels[0, 0], f"{seeds} held-out seeds, bars: 95 % paired bootstrap interval")

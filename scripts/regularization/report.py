@@ -10,7 +10,7 @@ import numpy as np
 
 from scripts.experiments.case import Case
 from scripts.experiments.scenario import FIGURE
-from scripts.regularization.search import METHODS, RIDGED
+from scripts.regularization.search import METHODS
 from scripts.regularization.trials import QUICK_TRIALS, SAME, TINY, Trial, Verdict, dominates, verdicts
 from scripts.shared.rows import Array
 
@@ -35,7 +35,23 @@ def summary(runs: Rows, case: str, point: str) -> tuple[float, float]:
 
 def has_ridge(point: str) -> bool:
     """Return whether the data of a point have the ridge."""
-    return point == RIDGE or point.startswith(RIDGED)
+    return point.startswith(RIDGE)
+
+
+def twin(point: str) -> str:
+    """Return the name of a point's weights with the ridge in the data."""
+    return f"{RIDGE} and {point}"
+
+
+def without_ridge(point: str) -> str:
+    """Return the point whose twin this is, else the point itself."""
+    return point.removeprefix(f"{RIDGE} and ")
+
+
+def twins(points: Rows, runs: Rows, case: Case) -> list[str]:
+    """Return the points that are tried once more with the ridge: those that are worse in no scenario."""
+    mine = [row["point"] for row in points if row["case"] == case.name and not has_ridge(row["point"])]
+    return [twin(point) for point in mine if excess(runs, case, point)[0] <= SAME]
 
 
 def excess(runs: Rows, case: Case, point: str) -> tuple[float, str]:
@@ -63,6 +79,7 @@ def choose(points: Rows, runs: Rows, case: Case, ridged: bool = False) -> str:
         ridged: whether the points with the ridge are meant, instead of those without.
     """
     names = [RIDGE if ridged else "paper", *(row["point"] for row in points if row["case"] == case.name)]
+    names += twins(points, runs, case) if ridged else []
     fit = [name for name in names if has_ridge(name) == ridged and excess(runs, case, name)[0] <= SAME]
     fit = fit or ["paper"]
     return min(fit, key=lambda name: errors(runs, case.name, name, VALIDATED, ATTACKED_TRIAL).mean())
@@ -72,7 +89,8 @@ def candidates(points: Rows, runs: Rows, case: Case) -> dict[str, str]:
     """Return the points that are judged beside the paper's weights, and what they are called."""
     found = {choose(points, runs, case): "tuned weights", RIDGE: "paper's weights, ridge"}
     tuned = choose(points, runs, case, ridged=True)
-    found |= {} if tuned in (RIDGE, "paper") else {tuned: "weights tuned with the ridge"}
+    label = "weights tuned with the ridge" if tuned == without_ridge(tuned) else "tuned weights and the ridge"
+    found |= {} if tuned in (RIDGE, "paper") else {tuned: label}
     return {name: label for name, label in found.items() if name != "paper"}
 
 
@@ -134,9 +152,9 @@ def point_table(case: Case, points: Rows, runs: Rows) -> list[str]:
         where = f"{growth:+.0%}, {trial.removesuffix(', no attack')}" if growth > 0 else "none"
         return [*(f"{value:.4f}" for value in summary(runs, case.name, point)), where]
 
+    chosen = candidates(points, runs, case)
     for name, label in (("paper", "the paper's"), (RIDGE, "the paper's, ridge")):
         lines.append("| " + " | ".join([label, "", "", "", "", *outcome(name)]) + " |")
-    chosen = candidates(points, runs, case)
     order = list(METHODS)
     mine = [row for row in points if row["case"] == case.name]
     for row in sorted(mine, key=lambda row: (order.index(row["method"]), float(row["attacked_weight"]))):
@@ -145,13 +163,17 @@ def point_table(case: Case, points: Rows, runs: Rows) -> list[str]:
         cells += [f"{float(row['total']):.4f}" if float(row["attacked_weight"]) == 1 else ""]
         cells += outcome(row["point"])
         lines.append("| " + " | ".join(cells) + " |")
+    for name in twins(points, runs, case):
+        label = f"{without_ridge(name)}, ridge" + (", **chosen**" if name in chosen else "")
+        lines.append("| " + " | ".join([label, "", "", "", "", *outcome(name)]) + " |")
     seeds = len(errors(runs, case.name, "paper", VALIDATED, ATTACKED_TRIAL))
     return [*lines, "", f"Errors on {seeds} validation recordings; a growth above {SAME:.0%} rejects a point."]
 
 
 def weight_lines(case: Case, points: Rows, runs: Rows) -> list[str]:
     """Return the paper's and the chosen weights."""
-    paper, labels = case.paper(), candidates(points, runs, case)
+    paper = case.paper()
+    labels = {without_ridge(name): label for name, label in candidates(points, runs, case).items()}
 
     def line(name: str, lambdas: Sequence[float], Q: Sequence[float], R: Sequence[float]) -> str:
         cells = [name, *(f"{v:.3g}" for v in lambdas), *(", ".join(f"{v:.3g}" for v in d) for d in (Q, R))]

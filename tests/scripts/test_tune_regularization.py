@@ -139,10 +139,17 @@ def test_points_with_the_ridge_are_chosen_apart():
     runs = rows_of("paper", (1.0, 2.0), report.VALIDATED) + rows_of("ridge", (0.9, 1.0), report.VALIDATED)
     runs += rows_of("guarded 1", (1.1, 0.1), report.VALIDATED)  # pays with tracking
     runs += rows_of("ridged 1", (0.8, 0.9), report.VALIDATED)
+    assert report.twins(points, runs, CASES["moving"]) == []  # none without the ridge may be chosen
     assert report.choose(points, runs, CASES["moving"]) == "paper"
     assert report.choose(points, runs, CASES["moving"], ridged=True) == "ridged 1"
     names = {"ridge": "paper's weights, ridge", "ridged 1": "weights tuned with the ridge"}
     assert report.candidates(points, runs, CASES["moving"]) == names
+    fit = [{"case": "moving", "point": "attack 0.3", "method": "attack"}]
+    runs += rows_of("attack 0.3", (0.7, 2.1), report.VALIDATED)  # better without an attack, no better under it
+    assert report.twins(points + fit, runs, CASES["moving"]) == ["ridge and attack 0.3"]
+    runs += rows_of("ridge and attack 0.3", (0.7, 0.8), report.VALIDATED)
+    names = {"ridge": "paper's weights, ridge", "ridge and attack 0.3": "tuned weights and the ridge"}
+    assert report.candidates(points + fit, runs, CASES["moving"]) == names
 
 
 # --- the judgement ----------------------------------------------------------------------------------------------------
