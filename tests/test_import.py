@@ -58,8 +58,18 @@ def test_the_import_warns_of_nothing():
     run("import torch_dpc", "-W", "error")
 
 
+#: What 0.3 s are of torch's own import (0.8 s) on an idle machine: other processes slow both down alike.
+SHARE = 0.37
+BOTH = """
+import time
+start = time.process_time(); import torch
+between = time.process_time(); import torch_dpc
+print(between - start, time.process_time() - between)
+"""
+
+
 @pytest.mark.slow
 def test_the_import_is_short():
-    """At most 0.3 s beyond torch: processor time, the least of five, because other processes may run beside it."""
-    code = "import torch, time; start = time.process_time(); import torch_dpc; print(time.process_time() - start)"
-    assert min(float(run(code)) for _ in range(5)) < 0.3
+    """At most 0.3 s beyond torch, or that share of torch's own import: processor time, the least of five."""
+    times = [tuple(map(float, run(BOTH).split())) for _ in range(5)]
+    assert min(own for _, own in times) < 0.3 or min(own / of_torch for of_torch, own in times) < SHARE, times

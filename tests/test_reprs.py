@@ -58,7 +58,8 @@ def objects():
         *(attacks.FiniteDifferenceAttack(LAYER, cost, budget), attacks.RandomSearchAttack(LAYER, cost, budget)),
         *(policy, attacks.PolicyAttack(policy, budget)),
         attacks.SignalAttack(plant, controller, attacks.RunError(), budget),
-        attacks.PoisonedRecording(LAYER, cost, budget, samples=2),
+        *(attacks.PoisonedRecording(LAYER, cost, budget, samples=2), attacks.AttackOn("u_ini", attack)),
+        attacks.BoundViolation(-1.0, 1.0),
         attacks.robustness_curve(plant, controller, attack, rhos=[0.0, 0.1], y_ref=torch.ones(4), steps=4, batch=2),
         *(detector, calibrated, calibrated.statistic(u_ini, y_ini), detection.Cusum(calibrated.score, 1.0, 2.0)),
         *(tuning.Windows(u_ini, y_ini, torch.ones(4)), objective, tuning.WeightScales(LAYER), tuning.MeanError([0])),
@@ -71,7 +72,8 @@ def objects():
 #: Interfaces, what is returned by what takes long, and what needs an extra (tested below, where it is installed).
 NOT_MADE = {
     *("Attack", "Budget", "ConvexSet", "Plant", "Planner", "TorchPlant"),
-    *("WorstCase", "SensitivityBound", "Poisoned", "TuningResult", "Verdict", "Positive", "Semidefinite"),
+    *("WorstCase", "SensitivityBound", "CertifiedInterval", "Poisoned"),
+    *("TuningResult", "Verdict", "Positive", "Semidefinite"),
     *("Quadrotor", "GymPlant"),
 }
 

@@ -132,7 +132,7 @@ class TrackingError(Described):
         )
 
 
-class BoundViolation:
+class BoundViolation(Described):
     """psi = -(sum of what the planned outputs exceed bounds by): take the controller's plan away.
 
     A problem with hard bounds has no violation; it has no plan. So give the attack a surrogate of the controller whose

@@ -18,7 +18,7 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from scipy import linalg
+import scipy
 
 from ..budgets.base import NormBound
 from .complementarity import HIGH, LOW, Array, Rows, allowed_states
@@ -88,7 +88,7 @@ class Moments:
         scaled = G * self.scale[:, None] * self.scale
         values, vectors = np.linalg.eigh(scaled) if self.n else (np.ones(0), np.ones((0, 0)))
         root = vectors / np.sqrt(np.maximum(values, SETTINGS.floor * values.max(initial=1.0)))
-        self.T = linalg.block_diag(np.eye(1 + d), root * self.scale[:, None])
+        self.T = scipy.linalg.block_diag(np.eye(1 + d), root * self.scale[:, None])
         self.G_scaled = scaled
         self.dense = [_dense(piece, self.one, d) for piece in pieces]
         inner = sum(piece.matrix.T @ piece.matrix for piece in pieces)
@@ -206,17 +206,17 @@ class Moments:
         Q = rest.copy()
         Q[0, 0] += bound
         try:
-            root = linalg.cholesky(Q[1:, 1:], lower=True)
+            root = scipy.linalg.cholesky(Q[1:, 1:], lower=True)
         except np.linalg.LinAlgError:
             return None
-        centre = linalg.solve_triangular(root, Q[1:, 0], lower=True)
+        centre = scipy.linalg.solve_triangular(root, Q[1:, 0], lower=True)
         radius = float(centre @ centre - Q[0, 0])
         if radius < 0:
             return None
 
         def most(functionals: Array) -> Array:
             f = functionals @ self.T
-            x = linalg.solve_triangular(root, f[:, 1:].T, lower=True)
+            x = scipy.linalg.solve_triangular(root, f[:, 1:].T, lower=True)
             return f[:, 0] - centre @ x + np.sqrt(radius * (x * x).sum(0))
 
         return most

@@ -18,8 +18,8 @@ from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import linalg
 
 from .complementarity import Array
 
@@ -138,7 +138,7 @@ class _Iterate:
         return None
 
     def _invert(self, root: Array) -> None:
-        self.inverse_root = linalg.solve_triangular(root, np.eye(len(root)), lower=True, check_finite=False)
+        self.inverse_root = scipy.linalg.solve_triangular(root, np.eye(len(root)), lower=True, check_finite=False)
         self.Z = self.inverse_root.T @ self.inverse_root
 
     @property
@@ -161,7 +161,7 @@ class _Iterate:
         moments_root = _cholesky(self.Y)
         if solve is None or moments_root is None:
             return False
-        inverse = linalg.solve_triangular(moments_root, np.eye(len(self.Y)), lower=True, check_finite=False)
+        inverse = scipy.linalg.solve_triangular(moments_root, np.eye(len(self.Y)), lower=True, check_finite=False)
         ahead = self._direction(solve, 0.0, 0.0, 0.0)
         dual, primal = (min(1.0, length) for length in self._lengths(ahead, inverse))
         pairs = ((self.Y + primal * ahead.Y) * (self.M + dual * ahead.M)).sum()
@@ -205,10 +205,10 @@ class _Iterate:
         H *= scale[:, None] * scale
         H[diagonal, diagonal] += SETTINGS.regularization
         try:
-            factor = linalg.cho_factor(H, check_finite=False)
+            factor = scipy.linalg.cho_factor(H, check_finite=False)
         except np.linalg.LinAlgError:
             return None
-        return lambda right: scale * linalg.cho_solve(factor, scale * right, check_finite=False)
+        return lambda right: scale * scipy.linalg.cho_solve(factor, scale * right, check_finite=False)
 
     def _direction(
         self, solve: Callable[[Array], Array], mu: float, curved: Array | float, curved_slack: Array | float
@@ -232,13 +232,13 @@ class _Iterate:
 
 def _cholesky(X: Array) -> Array | None:
     try:
-        return linalg.cholesky(X, lower=True, check_finite=False)
+        return scipy.linalg.cholesky(X, lower=True, check_finite=False)
     except np.linalg.LinAlgError:
         return None
 
 
 def _until_singular(inverse_root: Array, change: Array) -> float:
-    least = linalg.eigvalsh(inverse_root @ change @ inverse_root.T, check_finite=False, subset_by_index=[0, 0])[0]
+    least = scipy.linalg.eigvalsh(inverse_root @ change @ inverse_root.T, check_finite=False, subset_by_index=[0, 0])[0]
     return 1 / max(-float(least), 1e-12)
 
 
