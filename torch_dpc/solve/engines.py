@@ -36,12 +36,10 @@ class Choice:
 
     Attributes:
         daqp_batch: without the compiled kernels, DAQP takes batches of boxes up to this size on the CPU.
-        few_left: so many samples that the kernel leaves, and fewer, go to the last resort; more to the torch engine.
         chunk: samples that the torch engine for general sets takes at once; each needs some N^2 numbers.
     """
 
     daqp_batch: int = 16
-    few_left: int = 16
     chunk: int = 256
 
 
@@ -144,8 +142,7 @@ class Engines:
         flat_G = G if G.ndim == 2 else G.expand(*batch, *G.shape[-2:]).reshape(-1, *G.shape[-2:])
         found = kernels.solve_sets(flat_G, v0.reshape(-1, v0.shape[-1]), values)
         found = Found(found.lam.reshape(v0.shape), found.iterations.reshape(batch), found.converged.reshape(batch))
-        left = int((~found.converged).sum())
-        return found if left <= CHOICE.few_left else self._completed(found, v0, sets)
+        return found if bool(found.converged.all()) else self._completed(found, v0, sets)
 
     def _completed(self, found: Found, v0: Tensor, sets: FeasibleSet) -> Found:
         """Return what was found, with the torch engine's answer for the samples that had not converged."""
