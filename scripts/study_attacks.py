@@ -35,7 +35,7 @@ from scripts.shared.rows import Array, Rows, read_rows
 from scripts.shared.tables import Table, as_they_finish, missing
 from torch_dpc import attacks
 
-SEEDS, QUICK_SEEDS = 8, 2
+SEEDS, QUICK_SEEDS = 5, 2
 FIRST_SEED = 8000  # never looked at during development
 WINDOW_EVERY, QUICK_EVERY = 12, 48
 PLANTS = {"masses": "Oscillating masses", "quadrotor": "Quadrotor"}

@@ -201,7 +201,7 @@ def close_loops(runs: Table, jobs: list[tuple[Any, ...]], workers: int, label: s
 
 
 def main(argv: list[str] | None = None) -> None:
-    parser = arguments(__doc__, seeds=8)
+    parser = arguments(__doc__, seeds=6)
     parser.add_argument("--plants", nargs="+", choices=("masses", "quadrotor"), default=["masses", "quadrotor"])
     parser.add_argument(
         "--methods", nargs="+", choices=list(METHODS), default=list(METHODS), help="searches to compare"
