@@ -66,7 +66,8 @@ class RobustDPC(DPCLayer):
     """Plan for the worst measurement error in a ball, with the layer's call and result.
 
     It predicts by the recording alone: the limit of large lambda_g and lambda_s. Its plans have no derivative, and
-    attacks by gradient are refused: attack it by `attacks.FiniteDifferenceAttack` or `attacks.RandomSearchAttack`.
+    attacks by gradient are refused: attack it by `attacks.FiniteDifferenceAttack` or `attacks.RandomSearchAttack`. A
+    plan that Clarabel reaches to its reduced tolerance alone (5e-5) is taken, and cvxpy warns of it.
 
     Args:
         layer: whose data, Q, R and boxes are taken; only these: no other terms.
