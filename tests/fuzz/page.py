@@ -9,9 +9,10 @@ they part. {versions}.
 
 {table}
 
-What is left sits in extreme weights, and in units that differ between
-channels which one `lambda_s` weighs: plans that cost more than the optimum by 1e-6 and more, and curved or priced sets
-that end as FAILED. Each finding is in `results/fuzz/failures.txt` with the call that replays it.
+What is left sits in units that differ between channels, where coefficients cancel by ten digits and more: curved sets
+that end as FAILED, and the rare g of double precision that does not reproduce its plan. Undecided are mostly plans that
+the layer proves and the reference does not reach. Each finding is in `results/fuzz/failures.txt` with the call that
+replays it.
 
 ## The problems
 

@@ -30,9 +30,9 @@ from torch import Tensor
 
 from ..autodiff import carries_derivative, constant, untransformed
 from .factorization import factor_cost
-from .least_squares import gram_of_charged, least_squares, moved_by, without_rounding
+from .graph import with_graph
+from .least_squares import least_squares, moved_by, without_rounding
 from .rows import DataRows
-from .saddle import Saddle, known_solution
 from .verification import Map, Posed, Term, verify
 from .weights import Weights
 
@@ -145,7 +145,9 @@ def reduce(rows: DataRows, weights: Weights) -> Reduction:
     if not carries_derivative((rows.C, rows.Yp, *weights.tensors.values())):
         return values
     reduction = replace(values, rows=rows, weights=weights, constants=values)
-    A_theta, A_lam = _with_graph(reduction)
+    known = torch.cat([values.A_theta, -values.A_lam], dim=-1)
+    solution = with_graph(rows, weights, known, values.T, values.Z)
+    A_theta, A_lam = solution[..., : rows.n_theta], -solution[..., rows.n_theta :]
     return replace(reduction, V=rows.C @ A_theta, G=rows.C @ A_lam, A_theta=A_theta, A_lam=A_lam)
 
 
@@ -268,32 +270,3 @@ def _map_of(flat: Reduction, i: int, kernel: Tensor) -> Map:
         kernel=kernel.cpu().numpy(),
         Eq_pinv=Eq_pinv.cpu().numpy(),
     )
-
-
-def _with_graph(reduction: Reduction) -> tuple[Tensor, Tensor]:
-    """Attach the derivative of [Psi Eq'; Eq 0] [a; mu] = [Phi theta - C' lam; e] to its known solution."""
-    rows, weights = reduction.rows, reduction.weights
-    # Psi = sum of rows' weight rows, and Phi likewise towards what each term is to meet.
-    terms: list[tuple[Tensor, Tensor, int | None]] = []
-    for term in rows.tracking:
-        if (weight := getattr(weights, term.weight)) is not None:
-            block = rows.C[..., term.rows, :]
-            terms.append(((weight @ block).mT, block, term.reference))
-    for fit in rows.fits:
-        terms.append((2 * getattr(weights, fit.weight)[..., None, None] * fit.rows.mT, fit.rows, fit.measured))
-    Psi = 2 * weights.lambda_g[..., None, None] * gram_of_charged(rows)
-    for weighted, block, _ in terms:
-        Psi = Psi + weighted @ block
-    batch = Psi.shape[:-2]
-    Phi = Psi.new_zeros(*batch, Psi.shape[-1], rows.n_theta)
-    for weighted, _, start in terms:
-        if start is not None:
-            Phi = Phi + torch.nn.functional.pad(weighted, (start, rows.n_theta - start - weighted.shape[-1]))
-    top = torch.cat([Phi, -rows.C.mT.expand(*batch, -1, -1)], dim=-1)
-    n_eq = rows.Eq.shape[-2]
-    bottom = top.new_zeros(n_eq, top.shape[-1])
-    bottom[torch.arange(n_eq), rows.Eq_theta] = 1.0
-    solution = torch.cat([reduction.A_theta, -reduction.A_lam], dim=-1)
-    saddle = Saddle(T=reduction.T, Z=reduction.Z, Eq_pinv=rows.Eq_pinv)
-    solution = known_solution(Psi, rows.Eq, top, bottom, solution.expand(*batch, -1, -1), saddle)
-    return solution[..., : rows.n_theta], -solution[..., rows.n_theta :]
