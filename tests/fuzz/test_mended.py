@@ -27,6 +27,7 @@ MENDED = {
     "no set at all, free directions: failed": ("any", 334),
     "free directions along which plans go far: failed": ("any", 1401),
     "prices on a cost of 1e-8: failed": ("any", 709),
+    "multipliers on the changes of the input: g misses its rows": ("any", 1981),
     "equalities that leave nothing free: an exception": ("any", 250),
 }
 

@@ -98,7 +98,8 @@ def _pulled(problem: Extended, sample: Sample, v: Array, lam: Array, known: Arra
     eye = np.eye(n, dtype=np.longdouble)
     eye[range(k, n), range(k, n)] = SETTINGS.charge
     wanted = w * (v - sample.c)[pulls] - lam[pulls] / w
-    target = np.concatenate([sample.xi0, np.zeros(n - k, dtype=np.longdouble), wanted])
+    pushed = lam[~known] @ M[~known]  # rows that are not known keep their multipliers
+    target = np.concatenate([sample.xi0 - pushed[:k], -pushed[k:] / SETTINGS.charge, wanted])
     R, rotated, order = triangle(np.concatenate([eye, w[:, None] * M[pulls]]), target[:, None])
     x = np.zeros(n, dtype=np.longdouble)
     x[order] = back(R, rotated[:n, 0])
