@@ -29,7 +29,8 @@ reproduce: $(ENV)  ## the paper's figures and tables, into results/
 
 # The numerical tests run a second time without the kernels: the path of a GPU, and of a machine without a compiler.
 NUMERICAL := tests/solve/test_gradients.py tests/solve/test_engines.py tests/solve/test_guards.py tests/fuzz/test_fuzz.py \
-	tests/sets/test_convex_sets.py tests/problem/test_reduction.py tests/problem/test_terms.py
+	tests/sets/test_convex_sets.py tests/problem/test_reduction.py tests/problem/test_terms.py \
+	tests/solve/test_optimality.py tests/solve/test_last_resort.py tests/problem/test_degenerate_data.py
 test: $(ENV)  ## every test and docstring example (ARGS="-m 'not slow'" for the quick ones)
 	@ignore=; $(HAS_PYBULLET) || ignore=--ignore=torch_dpc/systems/quadrotor.py; \
 	set -x; $(PY) -m pytest -n auto --dist worksteal tests --doctest-modules torch_dpc baselines $$ignore $(ARGS) && \
