@@ -7,9 +7,10 @@ from scipy.optimize import linprog
 
 from .blocks import Block
 from .conic import conic
-from .extended import LONG, Array
+from .extended import LONG, Array, long
 from .reduction import Reduced
 
+CONFIRMED = 1e-9  # v / scale of the solver and of the rows agree to this, or nothing is decided
 RANGE = 1e-9  # singular values below this share of the largest do not move v
 MARGIN = 1e-3  # sets are shrunk by up to so much, so that a plan that exists lies inside beyond a solver's tolerance
 
@@ -20,8 +21,9 @@ def least_violation(reduced: Reduced, blocks: list[Block]) -> float:
     if not hard:
         return 0.0
     c = np.asarray(reduced.c, float)
-    left, size, _ = np.linalg.svd(np.asarray(reduced.natural, float), full_matrices=False)
-    basis = left[:, size > RANGE * max(size.max(initial=0.0), 1e-300)]
+    left, size, right = np.linalg.svd(np.asarray(reduced.natural, float), full_matrices=False)
+    moving = size > RANGE * max(size.max(initial=0.0), 1e-300)
+    basis = left[:, moving]
     magnitude = max(1.0, float(np.abs(c).max()))  # numbers near 1 for the solvers
     if all(b.kind == "interval" for b in hard):
         x = _linear(hard, basis, c / magnitude, magnitude)
@@ -30,6 +32,10 @@ def least_violation(reduced: Reduced, blocks: list[Block]) -> float:
     if x is None:
         return np.nan
     v = basis @ (x * magnitude) + c
+    # The basis has rounding errors, and a far x can live on them: the rows themselves must reach v.
+    reached = reduced.natural @ long(right[moving].T @ (x * magnitude / size[moving])) + reduced.c
+    if np.abs(reached - v).max(initial=0.0) > CONFIRMED:
+        return np.nan
     return max(float(b.violation(b.z_of(v))) for b in hard)
 
 
