@@ -36,6 +36,7 @@ def main() -> None:
     parser.add_argument("--out", type=Path, default=ROOT / "results" / "fuzz")
     parser.add_argument("--workers", type=int, default=cores())
     parser.add_argument("--page", action="store_true", help="write docs/fuzz.md")
+    parser.add_argument("--held-out", type=Path, help="rows of a held-out stream, made before, for the page")
     asked = parser.parse_args()
     asked.out.mkdir(parents=True, exist_ok=True)
     reports = []
@@ -58,7 +59,8 @@ def main() -> None:
     (asked.out / "table.md").write_text(table)
     (asked.out / "failures.txt").write_text("\n".join(failures(reports)) + "\n")
     if asked.page:
-        (ROOT / "docs" / "fuzz.md").write_text(page(table))
+        other = asked.held_out and (asked.held_out.stem, markdown(read(asked.held_out)))
+        (ROOT / "docs" / "fuzz.md").write_text(page(table, other))
     print(table)
 
 

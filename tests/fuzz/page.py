@@ -8,7 +8,7 @@ PAGE = """# Random problems against an independent reference
 they part. {versions}.
 
 {table}
-
+{held_out}
 What is left sits in units that differ between channels, where coefficients cancel by ten digits and more: curved sets
 that end as FAILED, and the rare g of double precision that does not reproduce its plan. Undecided are mostly plans that
 the layer proves and the reference does not reach. Each finding is in `results/fuzz/failures.txt` with the call that
@@ -49,7 +49,16 @@ Where the rank of the recording is a matter of opinion (a singular value between
 difference is counted as undecided."""
 
 
-def page(table: str) -> str:
-    """Return the page with a table."""
+HELD_OUT = """
+A held-out stream, `--stream {stream}`, none of whose problems was looked at before:
+
+{table}
+"""
+
+
+def page(table: str, held_out: tuple[str, str] | None = None) -> str:
+    """Return the page with a table, and with that of a held-out stream, given as its name and table."""
     made = versions(1, 1).split("; seeds")[0]
-    return PAGE.replace("{versions}", f"One run with {made}").replace("{table}", table)
+    other = "" if held_out is None else HELD_OUT.replace("{stream}", held_out[0]).replace("{table}", held_out[1])
+    whole = PAGE.replace("{versions}", f"One run with {made}").replace("{table}", table)
+    return whole.replace("{held_out}", other)
