@@ -12,8 +12,8 @@ from torch import Tensor
 import torch_dpc as dpc
 from scripts.bench.cases import take
 from scripts.bench.higher_precision import relative
+from scripts.bench.learning import with_sets
 from scripts.bench.ratios import both, case, forward, milliseconds
-from scripts.study_learning import with_sets
 
 RADIUS = 0.8
 CHECKED = 3  # problems whose errors are measured

@@ -17,7 +17,7 @@ from torch import Tensor
 import torch_dpc as dpc
 from scripts.bench.cases import CYCLE, N_G, T_INI, inputs_of, layer_of, record, take
 from scripts.bench.daqp_loop import DaqpLoop
-from scripts.study_learning import learning, step_of, with_sets
+from scripts.bench.learning import learning, step_of, with_sets
 
 HORIZON = 25
 BLOCKS, WARM, MOST = 9, 3, 40  # blocks, calls of each that are not timed, and calls that are
