@@ -7,7 +7,6 @@ daqp    the dual active-set solver DAQP, for boxes
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -27,7 +26,6 @@ from .projected_system import ProjectedSystem
 from .splitting import resolvent_of, scale_of, solve_convex
 
 Sets = Bounds | FeasibleSet
-Engine = Callable[[Tensor, Sets], Found]
 
 
 @dataclass(frozen=True)
@@ -113,10 +111,9 @@ class Engines:
             return ("newton",)
         return ("daqp", "newton") if self.is_daqp_first(chosen, v0) else ("newton", "daqp")
 
-    def run(self, name: str, v0: Tensor, sets: Sets) -> Found:
-        """Solve by the engine of that name."""
-        engine: Engine = {"newton": self.newton, "daqp": self.daqp}[name]
-        return engine(v0, sets)
+    def run(self, name: str, v0: Tensor, sets: Sets, complete: bool = True) -> Found:
+        """Solve by the engine of that name; curved sets complete or as the compiled kernel leaves them."""
+        return self.daqp(v0, sets) if name == "daqp" else self.newton(v0, sets, complete)
 
     def is_daqp_first(self, chosen: str, v0: Tensor) -> bool:
         """Return whether DAQP solves boxes first: Newton is faster, except without its kernel for a few samples."""
@@ -130,7 +127,7 @@ class Engines:
         assert isinstance(sets, Bounds)
         return solve_daqp(self.reduction.G, self.reduction.Ct, v0, sets.lower, sets.upper, self.workspace)
 
-    def newton(self, v0: Tensor, sets: Sets) -> Found:
+    def newton(self, v0: Tensor, sets: Sets, complete: bool = True) -> Found:
         """Solve by semismooth Newton: compiled if there is a kernel for the sets, in torch what that leaves."""
         if isinstance(sets, Bounds):
             return solve_newton(self.reduction.G, self.reduction.Ct, v0, sets.lower, sets.upper)
@@ -142,7 +139,7 @@ class Engines:
         flat_G = G if G.ndim == 2 else G.expand(*batch, *G.shape[-2:]).reshape(-1, *G.shape[-2:])
         found = kernels.solve_sets(flat_G, v0.reshape(-1, v0.shape[-1]), values)
         found = Found(found.lam.reshape(v0.shape), found.iterations.reshape(batch), found.converged.reshape(batch))
-        return found if bool(found.converged.all()) else self._completed(found, v0, sets)
+        return self._completed(found, v0, sets) if complete and not bool(found.converged.all()) else found
 
     def _completed(self, found: Found, v0: Tensor, sets: FeasibleSet) -> Found:
         """Return what was found, with the torch engine's answer for the samples that had not converged."""

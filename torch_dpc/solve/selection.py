@@ -42,7 +42,7 @@ class SelectionSettings:
 SETTINGS = SelectionSettings()
 
 
-def uncharged(reduction: Reduction, v0: Tensor, run: Callable[[Tensor], Found]) -> tuple[Found, Tensor]:
+def uncharged(reduction: Reduction, v0: Tensor, run: Callable[..., Found]) -> tuple[Found, Tensor]:
     """Return what an engine finds for the cost without a charge on its kernel, and K w, `(*batch, N)`.
 
     The plan is v0 + K w - G lam.
@@ -50,19 +50,22 @@ def uncharged(reduction: Reduction, v0: Tensor, run: Callable[[Tensor], Found]) 
     Args:
         reduction: in units, of a cost with a kernel.
         v0: unconstrained minimisers, `(*batch, N)`.
-        run: the engine.
+        run: the engine, and whether it completes what the compiled kernel leaves. It does so once: in further rounds
+            that takes seconds, and a sample stays where it was.
     """
     found, moved = run(v0), torch.zeros_like(v0)
+    lam, iterations, able = found.lam, found.iterations, found.converged
     for _ in range(SETTINGS.rounds):
-        along = times(reduction.kernel, times(reduction.kernel.mT, found.lam)) * reduction.gain[..., 0]
-        works = (_work(reduction.kernel, found.lam) > SETTINGS.work) & (along.abs().amax(-1) > SETTINGS.still)
-        works = works & found.converged
+        along = times(reduction.kernel, times(reduction.kernel.mT, lam)) * reduction.gain[..., 0]
+        works = (_work(reduction.kernel, lam) > SETTINGS.work) & (along.abs().amax(-1) > SETTINGS.still) & able
         if not bool(works.any()):
             break
-        moved = torch.where(works[..., None], moved - along, moved)
-        again = run(v0 + moved)
-        found = Found(again.lam, found.iterations + again.iterations, again.converged, again.gap)
-    return found, moved
+        trial = torch.where(works[..., None], moved - along, moved)
+        again = run(v0 + trial, complete=False)
+        able, better = able & again.converged, again.converged[..., None]
+        lam, moved = torch.where(better, again.lam, lam), torch.where(better, trial, moved)
+        iterations = iterations + again.iterations
+    return Found(lam, iterations, found.converged, found.gap), moved
 
 
 def _work(K: Tensor, lam: Tensor) -> Tensor:

@@ -59,6 +59,7 @@ class AugmentedLagrangianSettings:
         penalty, largest_penalty, growth: the first penalty, the largest, and the factor from round to round.
         easy_steps: Newton steps of a round up to which the penalty may grow.
         inner_steps: Newton steps of one round.
+        all_steps: Newton steps of all rounds after which a sample is given up, about a second.
         flat: slope at which a round is solved, relative to the first slope and |x|.
         slope_rounding: rounding of a slope, relative to its terms.
         near_rounding: a slope within this factor of its rounding counts as solved once it has stalled.
@@ -76,6 +77,7 @@ class AugmentedLagrangianSettings:
     growth: float = 10.0
     easy_steps: int = 20
     inner_steps: int = 40
+    all_steps: int = 200
     flat: float = 1e-12
     slope_rounding: float = 1e-16
     near_rounding: float = 100.0
@@ -216,7 +218,7 @@ def _augmented_lagrangian(
         best[rest] = torch.where(better[..., None], lam, best[rest])
         idle = torch.where(size < 0.5 * least[rest], 0, idle + 1)
         least[rest] = torch.where(better, size, least[rest])
-        stay = (size > LAGRANGIAN.close) & (idle < LAGRANGIAN.patience)
+        stay = (size > LAGRANGIAN.close) & (idle < LAGRANGIAN.patience) & (steps[rest] < LAGRANGIAN.all_steps)
         if not bool(stay.any()):
             break
         # The penalty does not grow after a round of many steps: better multipliers make the next one easier.
