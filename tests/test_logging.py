@@ -55,7 +55,7 @@ def test_a_second_engine_is_told(log):
     solver = layer.factored(CPU).solver
     engines = solver.in_units.engines
     found = engines.newton
-    lost = lambda v0, sets: replace(found(v0, sets), lam=torch.full_like(v0, torch.nan))  # noqa: E731
+    lost = lambda v0, *rest: replace(found(v0, *rest), lam=torch.full_like(v0, torch.nan))  # noqa: E731
     object.__setattr__(engines, "newton", lost)
     object.__setattr__(solver, "compiled", None)
     object.__setattr__(solver, "single", None)
