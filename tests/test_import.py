@@ -26,7 +26,7 @@ HEAVY = (
     "typer",
 )
 LOADED = f"import sys; print([name for name in {HEAVY!r} if name in sys.modules])"
-#: A layer with sets, a batch whose shapes have to be broadcast, and a gradient.
+#: A layer with sets, a batch whose shapes have to be broadcast, a gradient, and a plan in a curved set.
 FIRST_PLAN = """
 import torch
 import torch_dpc as dpc
@@ -36,6 +36,8 @@ data = dpc.HankelData.from_trajectories(u, u.cumsum(0) - u, t_ini=2, horizon=5)
 layer = dpc.DPCLayer(data, Q=1.0, R=0.1, lambda_g=1.0, lambda_s=1e3, u_set=dpc.Box(torch.tensor([-0.3]), 0.3))
 windows = torch.zeros(3, 1, 2, 1, requires_grad=True)
 layer(torch.zeros(4, 2, 1), windows, y_ref=torch.ones(1)).u.sum().backward()
+curved = dpc.DPCLayer(data, Q=1.0, R=0.1, lambda_g=1.0, lambda_s=1e3, u_set=dpc.Ball(0.3))
+curved(torch.zeros(2, 1), torch.zeros(2, 1), y_ref=torch.ones(1))
 """
 
 

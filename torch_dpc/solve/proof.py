@@ -18,6 +18,7 @@ import numpy as np
 from ..problem.extended import Extended, Sample
 from ..problem.long_double import Array, back, triangle
 from .cone_program import Ends, without_work
+from .consistency import NEGLIGIBLE, REACH
 
 
 @dataclass(frozen=True)
@@ -39,10 +40,10 @@ class ProofSettings:
     """
 
     gap: float = 1e-7
-    of_reference: float = 1e-8
+    of_reference: float = NEGLIGIBLE
     of_start: float = 1e-11
     row: float = 1e-8
-    reach: float = 1e3
+    reach: float = REACH
     pulls: tuple[float, ...] = (1e6, 1e9, 1e12, 1e15)
     near: float = 1e-9
     charge: float = 1e-9

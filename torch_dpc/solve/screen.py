@@ -21,6 +21,7 @@ from ..batching import times
 from ..problem.least_squares import gram_of_charged
 from ..problem.reduction import Reduction
 from ..problem.weights import psd_root
+from ..shapes import broadcast_shapes
 from .consistency import negligible_cost
 
 #: What is next to nothing, as a share of the cost.
@@ -59,7 +60,7 @@ class Screen:
         for fit in rows.fits:
             root = (2 * getattr(weights, fit.weight)).sqrt()[..., None, None]
             parts.append((root * fit.rows, root * torch.eye(fit.rows.shape[-2]).to(fit.rows), fit.measured))
-        batch = torch.broadcast_shapes(*(block.shape[:-2] for block, _, _ in parts))
+        batch = broadcast_shapes(*(block.shape[:-2] for block, _, _ in parts))
         E, target = [], []
         for block, root, start in parts:
             of_theta = block.new_zeros(*batch, block.shape[-2], rows.n_theta)

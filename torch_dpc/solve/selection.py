@@ -56,8 +56,9 @@ def uncharged(reduction: Reduction, v0: Tensor, run: Callable[..., Found]) -> tu
     found, moved = run(v0), torch.zeros_like(v0)
     lam, iterations, able = found.lam, found.iterations, found.converged
     for _ in range(SETTINGS.rounds):
-        along = times(reduction.kernel, times(reduction.kernel.mT, lam)) * reduction.gain[..., 0]
-        works = (_work(reduction.kernel, lam) > SETTINGS.work) & (along.abs().amax(-1) > SETTINGS.still) & able
+        pull = times(reduction.kernel.mT, lam)
+        along = times(reduction.kernel, pull) * reduction.gain[..., 0]
+        works = (_work(reduction.kernel, lam, pull) > SETTINGS.work) & (along.abs().amax(-1) > SETTINGS.still) & able
         if not bool(works.any()):
             break
         trial = torch.where(works[..., None], moved - along, moved)
@@ -68,7 +69,7 @@ def uncharged(reduction: Reduction, v0: Tensor, run: Callable[..., Found]) -> tu
     return Found(lam, iterations, found.converged, found.gap), moved
 
 
-def _work(K: Tensor, lam: Tensor) -> Tensor:
-    """Return the largest |K'lam| relative to its terms, `(*batch,)`."""
+def _work(K: Tensor, lam: Tensor, pull: Tensor) -> Tensor:
+    """Return the largest entry of pull = K'lam relative to its terms, `(*batch,)`."""
     terms = times(K.mT.abs(), lam.abs()).clamp_min(torch.finfo(lam.dtype).tiny)
-    return (times(K.mT, lam).abs() / terms).amax(-1)
+    return (pull.abs() / terms).amax(-1)
